@@ -1,0 +1,1 @@
+"""Reads recordings: summaries, the comparison with the centralised run, plots."""

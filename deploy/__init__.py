@@ -1,0 +1,1 @@
+"""Gains artefact to per-node sweep factors."""

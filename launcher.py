@@ -1,0 +1,5 @@
+"""The command line of octarm."""
+
+
+def main() -> None:
+    """Entry point, see `octarm --help`."""

@@ -1,0 +1,1 @@
+"""One arm segment: the sweep mathematics (pure) and the process around it."""

@@ -1,0 +1,1 @@
+"""The emulated arm: finite-difference mathematics (pure) and the process around it."""
