@@ -1,0 +1,261 @@
+"""The emulated arm: advances the exact model, chapter (1), by one tick under held commands.
+
+Stands where the hardware would: commands of the segments in, measurements out (theory, section 6).
+The forces are in `plant.elastic`, the grid in `plant.grid`; this module holds the state and the
+time integration.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from plant.disturbance import NO_DISTURBANCE, Disturbance, DisturbanceSpec, make_disturbance
+from plant.elastic import ElasticForce, elastic_energy, rest_shape, strains
+from plant.grid import Grid, check_faces, interpolation_matrix, load_matrix, plant_cells
+from plant.initial import STRAIGHT, InitialShape
+from wire.artefact import Arm
+from wire.errors import UsageError
+
+Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+CFL_SAFETY = 0.8
+"""Default length of a substep as a fraction of the explicit integrator's stability limit."""
+_SHORTEST_CELL = (
+    0.25  # compression, as a fraction of the cell, up to which the substep follows the limit
+)
+
+
+@dataclass(frozen=True)
+class PlantParameters:
+    """What an emulated arm is made of; checked and completed when made.
+
+    faces_m: faces s_0 = 0 < ... < s_n = L of the n segments; tick_s: how long a command is held;
+    initial: shape at t = 0, at rest; cells: of the plant's grid, None for max(40, 4 n); cfl_safety:
+    in (0, 1). Raises UsageError naming the parameter that is wrong.
+    """
+
+    arm: Arm
+    faces_m: tuple[float, ...]
+    tick_s: float
+    initial: InitialShape = STRAIGHT
+    disturbance: DisturbanceSpec = NO_DISTURBANCE
+    cells: int | None = None
+    cfl_safety: float = CFL_SAFETY
+
+    def __post_init__(self) -> None:
+        faces = check_faces(self.faces_m, self.arm.length_m)
+        object.__setattr__(self, "faces_m", faces)
+        object.__setattr__(self, "cells", plant_cells(len(faces) - 1, self.cells))
+        if not (math.isfinite(self.tick_s) and self.tick_s > 0.0):
+            raise UsageError(f"tick_s: expected a positive number of seconds, got {self.tick_s!r}")
+        if not 0.0 < self.cfl_safety < 1.0:
+            raise UsageError(
+                f"cfl_safety: expected a number between 0 and 1, got {self.cfl_safety!r}"
+            )
+
+    @property
+    def segments(self) -> int:
+        """Number n of segments."""
+        return len(self.faces_m) - 1
+
+    @property
+    def grid(self) -> Grid:
+        """The plant's own grid."""
+        return Grid(plant_cells(self.segments, self.cells), self.arm.length_m)
+
+
+def highest_frequency_rad_per_s(arm: Arm, grid: Grid, shortest_stretch: float = 1.0) -> float:
+    """Upper bound of the discrete arm's frequencies, from its axial and bending speeds.
+
+    The highest axial frequency on a grid of step ds is 2 sqrt(EA/rhoA)/ds, the highest bending
+    frequency 4 sqrt(EI/rhoA)/ds^2, and a cell compressed to the fraction `shortest_stretch` of its
+    length bends that much more per displacement, squared. The stiffness of a bent arm is the sum of
+    both, so the squares add.
+    """
+    mass = arm.mass_per_length_kg_per_m
+    axial = 2.0 * math.sqrt(arm.axial_stiffness_n / mass) / grid.step_m
+    bending = 4.0 * math.sqrt(arm.bending_stiffness_n_m2 / mass) / grid.step_m**2
+    return math.hypot(axial, bending / shortest_stretch**2)
+
+
+def _initial_position(initial: InitialShape, grid: Grid) -> Complex:
+    quarter = 0.25 * grid.step_m
+    middles = np.linspace(quarter, grid.length_m - quarter, 2 * grid.cells)
+    # Mean over each half cell by two Gauss points, exact for cubic curvatures.
+    offset = quarter / math.sqrt(3.0)
+    curvature = 0.5 * (
+        initial.curvature_per_m(middles - offset) + initial.curvature_per_m(middles + offset)
+    )
+    return rest_shape(curvature, initial.strain(grid.centres_m), grid)
+
+
+class ArmPlant:
+    """The state of the emulated arm.
+
+    Integrator: Strang splitting into drift (positions) and kick with drag (velocities; the flow of
+    v_t = a - d v with a held is exact), i.e. velocity Verlet when d = 0: second order, symplectic
+    without drag. A tick is cut into equal substeps below `cfl_safety` times the stability limit 2 /
+    omega, omega of `highest_frequency_rad_per_s` at the tick's start.
+    """
+
+    def __init__(self, parameters: PlantParameters) -> None:
+        self.parameters = parameters
+        arm, grid = parameters.arm, parameters.grid
+        self._grid = grid
+        self._mass = arm.mass_per_length_kg_per_m * grid.weights_m
+        self._disturbance: Disturbance | None = None
+        if parameters.disturbance.name != "none":
+            self._disturbance = make_disturbance(parameters.disturbance, arm)
+        self._force = ElasticForce(grid, arm.axial_stiffness_n, arm.bending_stiffness_n_m2)
+        self._position = _initial_position(parameters.initial, grid)
+        self._velocity = np.zeros(grid.cells, dtype=np.complex128)  # of the free nodes 1..cells
+        self._command = np.zeros(parameters.segments)
+        faces = np.asarray(parameters.faces_m)
+        self._load = load_matrix(faces, grid) / self._mass[:, None]  # acceleration per N/m
+        self._at_outer = interpolation_matrix(faces[1:], grid.nodes_m)[:, 1:]  # v(0) = 0
+        self._at_inner = interpolation_matrix(faces[:-1], grid.curvature_samples_m)
+        self._at_centre = interpolation_matrix(0.5 * (faces[1:] + faces[:-1]), grid.centres_m)
+        self._shape_matrices: dict[bytes, Array] = {}
+
+    def substeps(self) -> int:
+        """Number of substeps that the next tick takes."""
+        tick, safety = self.parameters.tick_s, self.parameters.cfl_safety
+        shortest = float(np.min(np.abs(np.diff(self._position)))) / self._grid.step_m
+        # A state that is not finite takes the ordinary number: it is reported, not repaired.
+        stretch = min(1.0, max(shortest, _SHORTEST_CELL)) if math.isfinite(shortest) else 1.0
+        frequency = highest_frequency_rad_per_s(self.parameters.arm, self._grid, stretch)
+        return max(1, math.ceil(tick * frequency / (2.0 * safety)))
+
+    def advance(self, command: Array, tick: int) -> None:
+        """Integrate over [tick, tick + 1) times tick_s with the command (n,) in N/m held.
+
+        Numbers that are not finite go through without a warning; see `first_non_finite`.
+        Raises ValueError if the command has another shape.
+        """
+        command = np.asarray(command, dtype=np.float64)
+        if command.shape != (self.parameters.segments,):
+            raise ValueError(
+                f"command: expected shape ({self.parameters.segments},), got {command.shape}"
+            )
+        self._command = command.copy()
+        count = self.substeps()
+        with np.errstate(all="ignore"):
+            self._integrate(self._accelerations(command, tick, count), count)
+
+    def _accelerations(self, command: Array, tick: int, count: int) -> Array:
+        """Transverse acceleration by the loads, m/s^2, at the substeps' ends (count + 1, cells)."""
+        held = self._load @ command
+        if self._disturbance is None:
+            return np.broadcast_to(held, (count + 1, held.size))
+        times = (tick + np.arange(count + 1) / count) * self.parameters.tick_s
+        density = self.parameters.arm.mass_per_length_kg_per_m
+        return held + self._disturbance(times, self._grid.nodes_m[1:]) / density
+
+    def _integrate(self, accelerations: Array, count: int) -> None:
+        """`count` substeps; inside, velocities are counted in metres per substep."""
+        arm, force, step = self.parameters.arm, self._force, self.parameters.tick_s / count
+        drag = arm.drag_per_s
+        decay, half_decay = np.array(math.exp(-drag * step)), math.exp(-0.5 * drag * step)
+        # int_0^step exp(-drag t) dt, and the part of it that the first and last half kicks take
+        reach = -math.expm1(-drag * step) / drag if drag > 0.0 else step
+        half = -math.expm1(-0.5 * drag * step) / drag if drag > 0.0 else 0.5 * step
+        gain = step * reach
+        force.set_scale(gain / (arm.mass_per_length_kg_per_m * self._grid.step_m))
+        loads = 1j * gain * accelerations
+        position, free, kick, evaluate = (
+            self._position,
+            self._position[1:],
+            force.kick,
+            force.evaluate,
+        )
+        moved = step * self._velocity
+        evaluate(position)
+        moved = half_decay * moved + (half / reach) * (kick + loads[0])
+        for load in loads[1:-1]:
+            np.add(free, moved, free)
+            evaluate(position)
+            np.multiply(moved, decay, moved)
+            np.add(moved, kick, moved)
+            np.add(moved, load, moved)
+        np.add(free, moved, free)
+        evaluate(position)
+        moved = half_decay * moved + (half / reach) * (kick + loads[-1])
+        self._velocity = moved / step
+
+    def measure(self) -> Array:
+        """Noise-free sensors (n, 2): v_y in m/s at the outer, curvature in 1/m at the inner face."""
+        curvature = strains(self._position, self._grid).curvature_per_m
+        return np.stack([self._at_outer @ self._velocity.imag, self._at_inner @ curvature], axis=1)
+
+    def truth(self) -> Array:
+        """The state as the segments hold it, (n, 4).
+
+        Columns: v_x and v_y in m/s at the outer face s_i, axial strain at the segment's centre,
+        curvature in 1/m at the inner face s_{i-1}; local cubics through the samples of the plant's
+        grid.
+        """
+        found = strains(self._position, self._grid)
+        velocity = self._at_outer @ self._velocity
+        strain = self._at_centre @ found.axial
+        curvature = self._at_inner @ found.curvature_per_m
+        return np.stack([velocity.real, velocity.imag, strain, curvature], axis=1)
+
+    def shape(self) -> Array:
+        """Positions of the grid nodes in m, (cells + 1, 2), from the clamp at (0, 0) to the tip."""
+        return np.stack([self._position.real, self._position.imag], axis=1)
+
+    def shape_at(self, s_m: npt.ArrayLike) -> Array:
+        """Positions in m at arclengths s_m (p,), shape (p, 2)."""
+        points = np.asarray(s_m, dtype=np.float64)
+        key = points.tobytes()
+        if key not in self._shape_matrices:
+            matrix = interpolation_matrix(points, self._grid.nodes_m)
+            self._shape_matrices = {key: matrix}  # one set of points is asked for again and again
+        return np.asarray(self._shape_matrices[key] @ self.shape())
+
+    def tip(self) -> Array:
+        """Position of the tip in m, shape (2,)."""
+        return np.array([self._position[-1].real, self._position[-1].imag])
+
+    def energy(self) -> tuple[float, float, float]:
+        """Kinetic, axial and bending energy in J."""
+        arm = self.parameters.arm
+        kinetic = 0.5 * float(np.sum(self._mass * np.abs(self._velocity) ** 2))
+        axial, bending = elastic_energy(
+            self._position, self._grid, arm.axial_stiffness_n, arm.bending_stiffness_n_m2
+        )
+        return kinetic, axial, bending
+
+    def clamp_reaction(self) -> tuple[float, float, float]:
+        """What the clamp does to the arm: force (x, y) in N and moment in N m."""
+        self._force.set_scale(1.0)
+        self._force.evaluate(self._position)
+        internal, moment = self._force.clamp
+        return -internal.real, -internal.imag, -moment
+
+    def first_non_finite(self) -> str | None:
+        """Field and place of the first number that is not finite, None if all are finite."""
+        outer = np.asarray(self.parameters.faces_m)[1:]
+        nodes = self._grid.nodes_m
+        for field, values, places in (
+            ("command force_n_per_m", self._command, outer),
+            ("position x_m", self._position.real, nodes),
+            ("position y_m", self._position.imag, nodes),
+            ("velocity_x_m_per_s", self._velocity.real, nodes[1:]),
+            ("velocity_y_m_per_s", self._velocity.imag, nodes[1:]),
+        ):
+            wrong = np.flatnonzero(~np.isfinite(values))
+            if wrong.size:
+                index = int(wrong[0])
+                return f"plant {field} at s = {places[index]:.4g} m is {values[index]}"
+        return None
+
+
+def with_cells(parameters: PlantParameters, cells: int) -> PlantParameters:
+    """The same plant on another grid, for convergence studies."""
+    return replace(parameters, cells=cells)
