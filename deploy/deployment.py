@@ -1,0 +1,215 @@
+"""Gains artefact, number of nodes, spacing and tick to the factors of every node (section 5).
+
+The design is done once on the continuous arm; this step puts it on any number of segments. Every
+deployment is checked before it is handed out: sweeps against the dense matrix, and stability of the
+sampled loop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NoReturn
+
+import numpy as np
+import numpy.typing as npt
+from numpy.polynomial import legendre
+
+from deploy.grid import Place, SegmentGrid, make_grid
+from deploy.semiseparable import NodeMatrices, multiply, realise
+from deploy.stability import SpectralRadius, longest_stable_tick, spectral_radius
+from deploy.step import Loop, Step, make_loop, make_step
+from wire.artefact import GainsArtefact, Setpoint
+from wire.errors import OctarmError, UsageError
+from wire.factors import INPUTS, OUTPUTS, STATES, NodeFactors, SweepFactors
+
+Array = npt.NDArray[np.float64]
+
+SWEEP_TOLERANCE = 1e-10
+"""Largest relative difference between sweeps and dense matrix that is accepted."""
+
+
+@dataclass(frozen=True, eq=False)
+class DenseStep:
+    """The same tick for a central computer: out = M (in - in_offset) + out_offset.
+
+    M (5n, 7n), in_offset (7n,), out_offset (5n,), flattened node by node in the order of
+    `SweepFactors`.
+    """
+
+    M: Array
+    in_offset: Array
+    out_offset: Array
+
+    def __call__(self, inputs: Array) -> Array:
+        """One tick: absolute inputs (n, 7) to absolute outputs (n, 5)."""
+        out = self.M @ (inputs.ravel() - self.in_offset) + self.out_offset
+        return np.asarray(out.reshape(-1, OUTPUTS), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Deployment:
+    """Everything that a run needs from the gains, and the evidence that it is right."""
+
+    faces_m: Array
+    """Segment boundaries, (n + 1,)."""
+    tick_s: float
+    setpoint_names: tuple[str, ...]
+    nodes: tuple[NodeFactors, ...]
+    dense: tuple[DenseStep, ...]
+    """Per setpoint, the centralised reference."""
+    ranks_forward: tuple[tuple[int, ...], ...]
+    """Per setpoint, numbers in the forward message at each of the n - 1 cuts, root to tip."""
+    ranks_backward: tuple[tuple[int, ...], ...]
+    """Per setpoint, numbers in the backward message at each of the n - 1 cuts, root to tip."""
+    check: float
+    """Largest relative difference of sweeps and dense matrix, random inputs, over all setpoints."""
+    spectral_radius: tuple[SpectralRadius, ...]
+    """Per setpoint, of one tick of the nominal closed loop."""
+    energy_weights: Array
+    """(n, 4): sum(energy_weights * x**2) is the energy in J of a deviation x (n, 4)."""
+    loops: tuple[Loop, ...]
+    """Per setpoint, the continuous-time model and gains on the grid."""
+
+    @cached_property
+    def longest_stable_tick_s(self) -> float:
+        """Longest tick with stable nominal loops on this grid, to 1 %; inf if any tick is.
+
+        Computed when asked for (some seconds at 100 nodes).
+        """
+        return longest_stable_tick(self.loops)
+
+    @property
+    def messages_per_tick(self) -> int:
+        """Messages between neighbours a tick, 2 (n - 1)."""
+        return 2 * (len(self.nodes) - 1)
+
+
+def deploy(
+    artefact: GainsArtefact,
+    nodes: int,
+    tick_s: float,
+    spacing: str | Sequence[float] = "equispaced",
+) -> Deployment:
+    """Put the gains of all setpoints on `nodes` segments for a tick of `tick_s` seconds.
+
+    `spacing` is "equispaced", "chebyshev" or the nodes + 1 segment boundaries in m. Raises
+    UsageError for fewer than 2 nodes, boundaries that do not divide the arm, a tick that is not a
+    positive number, or one that is too long for the gains (the message names the longest).
+    """
+    grid = make_grid(artefact.arm.length_m, nodes, spacing)
+    if isinstance(tick_s, bool) or not (math.isfinite(tick_s) and tick_s > 0.0):
+        raise UsageError(f"tick: expected a positive number of seconds, got {tick_s!r}")
+    loops = tuple(make_loop(artefact.arm, setpoint, grid) for setpoint in artefact.setpoints)
+    steps = [make_step(loop, tick_s) for loop in loops]
+    radii = tuple(spectral_radius(step) for step in steps)
+    for setpoint, radius in zip(artefact.setpoints, radii, strict=True):
+        if not radius.stable:
+            _refuse_tick(setpoint, radius, loops, tick_s)
+    dense: list[DenseStep] = []
+    factors: list[list[SweepFactors]] = []
+    worst = 0.0
+    for setpoint, step in zip(artefact.setpoints, steps, strict=True):
+        scaled = step.whole()
+        realisation = realise(scaled, OUTPUTS, INPUTS)
+        worst = max(worst, _difference(realisation, scaled))
+        in_offset, out_offset = _offsets(setpoint, grid)
+        matrix = scaled * step.scale_in / step.scale_out[:, None]
+        dense.append(DenseStep(matrix, in_offset.ravel(), out_offset.ravel()))
+        factors.append(_in_si(realisation, step, in_offset, out_offset))
+    if not worst <= SWEEP_TOLERANCE:
+        raise OctarmError(
+            f"deployment on {grid.nodes} nodes, tick {tick_s:g} s: sweeps and dense matrix differ "
+            f"by {worst:.1e} relative, expected at most {SWEEP_TOLERANCE:g}; the gains or the "
+            "spacing are too badly scaled, try a shorter tick or longer segments"
+        )
+    return Deployment(
+        faces_m=grid.faces_m,
+        tick_s=float(tick_s),
+        setpoint_names=tuple(setpoint.name for setpoint in artefact.setpoints),
+        nodes=tuple(_node(i, [f[i] for f in factors]) for i in range(grid.nodes)),
+        dense=tuple(dense),
+        ranks_forward=tuple(tuple(f.forward_sent for f in one[:-1]) for one in factors),
+        ranks_backward=tuple(tuple(f.backward_sent for f in one[1:]) for one in factors),
+        check=worst,
+        spectral_radius=radii,
+        energy_weights=grid.energy_weights(artefact.arm),
+        loops=loops,
+    )
+
+
+def _refuse_tick(
+    setpoint: Setpoint, radius: SpectralRadius, loops: Sequence[Loop], tick_s: float
+) -> NoReturn:
+    part = "observer" if radius.observer_error >= radius.controlled_state else "controller"
+    longest = longest_stable_tick(loops, tick_s)
+    remedy = (
+        f"the longest stable tick on this grid is {longest:.3g} s"
+        if longest > 0.0
+        else "no tick makes these gains stable here; use more nodes or design other gains"
+    )
+    raise UsageError(
+        f"tick {tick_s:g} s is too long: at setpoint {setpoint.name!r} the sampled {part} "
+        f"grows by a factor {radius.largest:.6g} a tick (must be below 1); {remedy}"
+    )
+
+
+def _difference(realisation: Sequence[NodeMatrices], scaled: Array) -> float:
+    """Sweeps against dense matrix: largest difference, random inputs, relative per component."""
+    random = np.random.default_rng(20090101)
+    worst = 0.0
+    for _ in range(4):
+        vector = random.standard_normal((len(realisation), INPUTS))
+        expected = (scaled @ vector.ravel()).reshape(-1, OUTPUTS)
+        size = np.max(np.abs(expected), axis=0)
+        error = np.max(np.abs(multiply(realisation, vector) - expected), axis=0)
+        worst = max(worst, float(np.max(error / np.where(size > 0.0, size, 1.0))))
+    return worst
+
+
+def _offsets(setpoint: Setpoint, grid: SegmentGrid) -> tuple[Array, Array]:
+    """The setpoint on the grid, as inputs (n, 7) and outputs (n, 5): x_e, feed-forward, y_e."""
+    in_offset = np.zeros((grid.nodes, INPUTS))
+    for column, place, series in (
+        (2, Place.CENTRE, setpoint.strain),
+        (3, Place.INNER_FACE, setpoint.curvature_per_m),
+        (4, Place.OUTER_FACE, setpoint.feedforward_n_per_m),
+        (6, Place.INNER_FACE, setpoint.curvature_per_m),
+    ):
+        scaled = 2.0 * grid.locations_m(place) / grid.length_m - 1.0
+        in_offset[:, column] = legendre.legval(scaled, np.asarray(series, dtype=np.float64))
+    return in_offset, in_offset[:, :OUTPUTS].copy()
+
+
+def _in_si(
+    realisation: Sequence[NodeMatrices], step: Step, in_offset: Array, out_offset: Array
+) -> list[SweepFactors]:
+    """Factors for inputs and outputs in SI; the sums stay in scaled units (sqrt of an energy)."""
+    inputs = step.scale_in.reshape(-1, INPUTS)
+    outputs = 1.0 / step.scale_out.reshape(-1, OUTPUTS, 1)
+    return [
+        SweepFactors(
+            D=outputs[i] * node.D * inputs[i],
+            P=outputs[i] * node.P,
+            Q=node.Q * inputs[i],
+            W=node.W,
+            U=outputs[i] * node.U,
+            R=node.R * inputs[i],
+            V=node.V,
+            in_offset=in_offset[i],
+            out_offset=out_offset[i],
+        )
+        for i, node in enumerate(realisation)
+    ]
+
+
+def _node(index: int, factors: Sequence[SweepFactors]) -> NodeFactors:
+    start = np.stack([one.out_offset for one in factors])
+    return NodeFactors(
+        index=index,
+        initial_estimate=start[:, :STATES].copy(),
+        initial_command=start[:, STATES].copy(),
+        setpoints=tuple(factors),
+    )
