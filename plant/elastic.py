@@ -58,13 +58,12 @@ def elastic_energy(
 
 
 def rest_shape(curvature_per_m: Array, strain: Array, grid: Grid) -> Complex:
-    """Positions (cells + 1,) whose discrete strains are those given.
+    """Positions (cells + 1,) in m whose discrete strains are exactly those given.
 
-    `curvature_per_m` is the mean curvature (2 cells,) of each half cell from the root, `strain`
-    (cells,) the axial strain at the cell centres.
+    `curvature_per_m` (cells,) at grid nodes 0..cells-1, `strain` (cells,) at the cell centres.
     """
-    turns = np.cumsum(curvature_per_m) * (0.5 * grid.step_m)
-    edges = grid.step_m * (1.0 + strain) * np.exp(1j * turns[::2])
+    angles = np.cumsum(curvature_per_m * grid.curvature_lengths_m)
+    edges = grid.step_m * (1.0 + strain) * np.exp(1j * angles)
     return np.concatenate([[0.0 + 0.0j], np.cumsum(edges)])
 
 

@@ -66,10 +66,11 @@ def check_faces(faces_m: Sequence[float], length_m: float) -> tuple[float, ...]:
 class Grid:
     """A uniform staggered grid of `cells` cells on [0, length_m].
 
-    Positions and velocities live at `nodes_m`, stretch and angle at `centres_m`. The curvature of
-    grid node j is the difference of the angles beside it; at the clamp, angle 0, it is that of half
-    a cell, whose middle is a quarter of a cell from the root; at the free tip it is 0
-    (`curvature_samples_m`).
+    Positions and velocities live at `nodes_m`, stretch and angle at `centres_m`, curvature at
+    `nodes_m`: the difference of the angles beside a node, at the clamp that of the first angle and
+    0 over half a cell, at the free tip 0. The curvature at the clamp is second order too: it
+    carries the moment at the root itself, and the slope of the curvature that the half cell leaves
+    out offsets the angles by the square of the step.
     """
 
     cells: int
@@ -92,13 +93,6 @@ class Grid:
         return np.linspace(half, self.length_m - half, self.cells)
 
     @property
-    def curvature_samples_m(self) -> Array:
-        """Where the curvatures are second-order samples, shape (cells + 1,), the tip included."""
-        samples = self.nodes_m
-        samples[0] = 0.25 * self.step_m
-        return samples
-
-    @property
     def weights_m(self) -> Array:
         """Length that each free grid node 1..cells stands for, shape (cells,); half at the tip."""
         weights = np.full(self.cells, self.step_m)
@@ -116,9 +110,8 @@ class Grid:
 def interpolation_matrix(points: Array, samples: Array) -> Array:
     """Matrix (points, samples) of interpolation by the cubic through the four samples around.
 
-    `samples` must increase. Points outside take the outermost cubic, so the matrix also
-    extrapolates the curvature by a quarter of a cell to the root. Fourth order in the distance of
-    the samples.
+    `samples` must increase. Points outside take the outermost cubic. Fourth order in the
+    distance of the samples.
     """
     width = min(_STENCIL, samples.size)
     matrix = np.zeros((points.size, samples.size))

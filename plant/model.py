@@ -73,24 +73,18 @@ def highest_frequency_rad_per_s(arm: Arm, grid: Grid, shortest_stretch: float = 
     """Upper bound of the discrete arm's frequencies, from its axial and bending speeds.
 
     The highest axial frequency on a grid of step ds is 2 sqrt(EA/rhoA)/ds, the highest bending
-    frequency 4 sqrt(EI/rhoA)/ds^2, and a cell compressed to the fraction `shortest_stretch` of its
-    length bends that much more per displacement, squared. The stiffness of a bent arm is the sum of
-    both, so the squares add.
+    frequency 4 sqrt(EI/rhoA)/ds^2; a cell compressed to the fraction `shortest_stretch` of its
+    length turns that much more per displacement. The stiffness of a bent arm is the sum of both, so
+    the squares add. The geometric stiffness of a stretched arm is left to the safety factor.
     """
     mass = arm.mass_per_length_kg_per_m
     axial = 2.0 * math.sqrt(arm.axial_stiffness_n / mass) / grid.step_m
     bending = 4.0 * math.sqrt(arm.bending_stiffness_n_m2 / mass) / grid.step_m**2
-    return math.hypot(axial, bending / shortest_stretch**2)
+    return math.hypot(axial, bending / shortest_stretch)
 
 
 def _initial_position(initial: InitialShape, grid: Grid) -> Complex:
-    quarter = 0.25 * grid.step_m
-    middles = np.linspace(quarter, grid.length_m - quarter, 2 * grid.cells)
-    # Mean over each half cell by two Gauss points, exact for cubic curvatures.
-    offset = quarter / math.sqrt(3.0)
-    curvature = 0.5 * (
-        initial.curvature_per_m(middles - offset) + initial.curvature_per_m(middles + offset)
-    )
+    curvature = initial.curvature_per_m(grid.nodes_m[:-1])
     return rest_shape(curvature, initial.strain(grid.centres_m), grid)
 
 
@@ -118,7 +112,7 @@ class ArmPlant:
         faces = np.asarray(parameters.faces_m)
         self._load = load_matrix(faces, grid) / self._mass[:, None]  # acceleration per N/m
         self._at_outer = interpolation_matrix(faces[1:], grid.nodes_m)[:, 1:]  # v(0) = 0
-        self._at_inner = interpolation_matrix(faces[:-1], grid.curvature_samples_m)
+        self._at_inner = interpolation_matrix(faces[:-1], grid.nodes_m)
         self._at_centre = interpolation_matrix(0.5 * (faces[1:] + faces[:-1]), grid.centres_m)
         self._shape_matrices: dict[bytes, Array] = {}
 
@@ -188,7 +182,7 @@ class ArmPlant:
         self._velocity = moved / step
 
     def measure(self) -> Array:
-        """Noise-free sensors (n, 2): v_y in m/s at the outer, curvature in 1/m at the inner face."""
+        """Noise-free sensors (n, 2): v_y in m/s at outer, curvature in 1/m at inner faces."""
         curvature = strains(self._position, self._grid).curvature_per_m
         return np.stack([self._at_outer @ self._velocity.imag, self._at_inner @ curvature], axis=1)
 
