@@ -8,7 +8,9 @@ time integration.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice, repeat
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +27,7 @@ Complex = npt.NDArray[np.complex128]
 
 CFL_SAFETY = 0.8
 """Default length of a substep as a fraction of the explicit integrator's stability limit."""
+_BLOCK = 64  # substeps whose disturbance is evaluated at once
 _SHORTEST_CELL = (
     0.25  # compression, as a fraction of the cell, up to which the substep follows the limit
 )
@@ -141,16 +144,20 @@ class ArmPlant:
         with np.errstate(all="ignore"):
             self._integrate(self._accelerations(command, tick, count), count)
 
-    def _accelerations(self, command: Array, tick: int, count: int) -> Array:
-        """Transverse acceleration by the loads, m/s^2, at the substeps' ends (count + 1, cells)."""
-        held = self._load @ command
+    def _accelerations(self, command: Array, tick: int, count: int) -> Iterator[Complex]:
+        """Accelerations (cells,) by the loads in m/s^2, at the count + 1 ends of the substeps."""
+        held = 1j * (self._load @ command)
         if self._disturbance is None:
-            return np.broadcast_to(held, (count + 1, held.size))
-        times = (tick + np.arange(count + 1) / count) * self.parameters.tick_s
+            yield from repeat(held, count + 1)
+            return
+        nodes = self._grid.nodes_m[1:]
         density = self.parameters.arm.mass_per_length_kg_per_m
-        return held + self._disturbance(times, self._grid.nodes_m[1:]) / density
+        for first in range(0, count + 1, _BLOCK):
+            ends = np.arange(first, min(first + _BLOCK, count + 1))
+            times = (tick + ends / count) * self.parameters.tick_s
+            yield from held + (1j / density) * self._disturbance(times, nodes)
 
-    def _integrate(self, accelerations: Array, count: int) -> None:
+    def _integrate(self, accelerations: Iterator[Complex], count: int) -> None:
         """`count` substeps; inside, velocities are counted in metres per substep."""
         arm, force, step = self.parameters.arm, self._force, self.parameters.tick_s / count
         drag = arm.drag_per_s
@@ -160,25 +167,26 @@ class ArmPlant:
         half = -math.expm1(-0.5 * drag * step) / drag if drag > 0.0 else 0.5 * step
         gain = step * reach
         force.set_scale(gain / (arm.mass_per_length_kg_per_m * self._grid.step_m))
-        loads = 1j * gain * accelerations
         position, free, kick, evaluate = (
             self._position,
             self._position[1:],
             force.kick,
             force.evaluate,
         )
+        scale, load = np.array(gain), np.empty_like(kick)
         moved = step * self._velocity
         evaluate(position)
-        moved = half_decay * moved + (half / reach) * (kick + loads[0])
-        for load in loads[1:-1]:
+        moved = half_decay * moved + (half / reach) * (kick + gain * next(accelerations))
+        for acceleration in islice(accelerations, count - 1):
             np.add(free, moved, free)
             evaluate(position)
             np.multiply(moved, decay, moved)
             np.add(moved, kick, moved)
+            np.multiply(acceleration, scale, load)
             np.add(moved, load, moved)
         np.add(free, moved, free)
         evaluate(position)
-        moved = half_decay * moved + (half / reach) * (kick + loads[-1])
+        moved = half_decay * moved + (half / reach) * (kick + gain * next(accelerations))
         self._velocity = moved / step
 
     def measure(self) -> Array:
@@ -248,8 +256,3 @@ class ArmPlant:
                 index = int(wrong[0])
                 return f"plant {field} at s = {places[index]:.4g} m is {values[index]}"
         return None
-
-
-def with_cells(parameters: PlantParameters, cells: int) -> PlantParameters:
-    """The same plant on another grid, for convergence studies."""
-    return replace(parameters, cells=cells)
