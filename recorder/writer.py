@@ -1,0 +1,105 @@
+"""The recording's file: an MCAP with one JSON channel per kind of number and node, readable after any crash.
+
+Last step of the data flow. Chunks are small and flushed on a stated period into an unbuffered file, so that a
+killed recorder loses no more than that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from time import monotonic
+
+import msgspec
+from mcap.writer import CompressionType, Writer
+
+from recorder.merge import Row
+from wire.channels import EVENTS, METADATA, SUMMARY, Channel
+
+CHUNK_BYTES = 64 * 1024
+_encode = msgspec.json.Encoder().encode
+
+
+class RecordingWriter:
+    """Writes ticks, events, metadata and attachments; `layout` gives the channels of each sender's rows."""
+
+    def __init__(
+        self, path: Path, tick_s: float, layout: Mapping[int, Sequence[Channel]], flush_s: float
+    ) -> None:
+        self._file = path.open("xb", buffering=0)  # never over an existing recording
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer.start(profile="", library="octarm")
+        self._tick_s = tick_s
+        self._flush_s = flush_s
+        self._flushed_at = monotonic()
+        self._schemas: dict[bytes, int] = {}
+        self._slices: dict[int, list[tuple[int, tuple[str, ...], int, int]]] = {}
+        self._events = self._register(EVENTS)
+        self._event_number = 0
+        for sender, channels in layout.items():
+            at, slices = 0, []
+            for channel in channels:
+                fields = ("tick", "time_s", *channel.fields)
+                end = at + len(channel.fields)
+                slices.append((self._register(channel), fields, at, end))
+                at = end
+            self._slices[sender] = slices
+
+    def _register(self, channel: Channel) -> int:
+        schema = channel.schema
+        if schema not in self._schemas:
+            self._schemas[schema] = self._writer.register_schema(
+                channel.schema_name, "jsonschema", schema
+            )
+        return self._writer.register_channel(channel.topic, "json", self._schemas[schema])
+
+    def head(self, metadata: Mapping[str, str], attachments: Mapping[str, str]) -> None:
+        """Write what is known before the run, and make it safe on disk."""
+        self._writer.add_metadata(METADATA, dict(metadata))
+        for name, text in attachments.items():
+            media = "application/json" if name.endswith(".json") else "text/plain"
+            self._writer.add_attachment(0, 0, name, media, text.encode())
+        self.flush()
+
+    def tick(self, tick: int, rows: Mapping[int, Row]) -> None:
+        """Write one tick: the senders in the order of the layout, each row cut into its channels."""
+        time_s = tick * self._tick_s
+        log_time = self._log_time(tick)
+        add = self._writer.add_message
+        for sender, slices in self._slices.items():
+            row = rows.get(sender)
+            if row is None:
+                continue
+            for channel, fields, begin, end in slices:
+                message = dict(zip(fields, (tick, time_s, *row[begin:end]), strict=True))
+                add(channel, log_time, _encode(message), log_time, tick)
+
+    def event(self, tick: int, level: str, name: str, message: str) -> None:
+        """Write one line of the run's story."""
+        time_s = tick * self._tick_s
+        record = {"tick": tick, "time_s": time_s, "level": level, "name": name, "message": message}
+        log_time = self._log_time(tick)
+        self._event_number += 1
+        self._writer.add_message(
+            self._events, log_time, _encode(record), log_time, self._event_number
+        )
+
+    def _log_time(self, tick: int) -> int:
+        return round(tick * self._tick_s * 1e9)
+
+    def flush_if_due(self) -> None:
+        """Flush when the stated period is over."""
+        if monotonic() - self._flushed_at >= self._flush_s:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand everything written so far to the operating system."""
+        self._writer.flush()
+        self._flushed_at = monotonic()
+
+    def close(self, summary: Mapping[str, str]) -> None:
+        """Write the final counters and the index, and close the file."""
+        self._writer.flush()
+        self._writer.add_metadata(SUMMARY, dict(summary))
+        self._writer.finish()
+        self._file.close()

@@ -1,0 +1,128 @@
+"""One child process of a run: started in a session of its own, spoken to in JSON lines, watched by its pidfd.
+
+Between the conductor, which decides, and the operating system. Signals go through pidfds, so that a number that
+the system has given to somebody else is never hit.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import IO, Any
+
+PYTHON_ROOT = Path(__file__).resolve().parent.parent
+
+
+class Handle:
+    """A process that this run started, directly or through the zygote, by pidfd."""
+
+    def __init__(self, name: str, pid: int) -> None:
+        self.name = name
+        self.pid = pid
+        try:
+            self._fd = os.pidfd_open(pid)
+        except ProcessLookupError:
+            self._fd = -1
+
+    def fileno(self) -> int:
+        """The pidfd: readable when the process has ended; -1 if it is gone."""
+        return self._fd
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process still runs."""
+        if self._fd < 0:
+            return False
+        poll = select.poll()
+        poll.register(self._fd, select.POLLIN)
+        return not poll.poll(0)
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal; nothing happens if the process has ended."""
+        if self._fd >= 0:
+            try:
+                signal.pidfd_send_signal(self._fd, number)
+            except ProcessLookupError:
+                pass
+
+    def close(self) -> None:
+        """Give the pidfd back."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+
+class Process(Handle):
+    """A direct child: a Python module of this project with pipes for control and status."""
+
+    def __init__(self, name: str, module: str, arguments: list[str], log: IO[bytes]) -> None:
+        environment = dict(os.environ)
+        environment["OPENBLAS_NUM_THREADS"] = "1"
+        environment["PYTHONUNBUFFERED"] = "1"
+        self._popen = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            cwd=PYTHON_ROOT,
+            env=environment,
+            start_new_session=True,  # Ctrl-C is for the launcher, which then ends the others in order
+        )
+        super().__init__(name, self._popen.pid)
+        if self._popen.stdin is None or self._popen.stdout is None:
+            raise RuntimeError("a pipe to a child is missing")
+        self.control = self._popen.stdin
+        self.status = self._popen.stdout.fileno()
+        self._partial = b""
+        os.set_blocking(self.status, False)
+
+    def tell(self, line: str) -> None:
+        """Write one line to the child; a child that is gone is noticed elsewhere."""
+        try:
+            self.control.write(line.encode() + b"\n")
+            self.control.flush()
+        except (BrokenPipeError, ValueError):
+            return
+
+    def order(self, **message: Any) -> None:
+        """Write one control message to the child."""
+        self.tell(json.dumps(message))
+
+    def lines(self) -> list[dict[str, Any]] | None:
+        """Status lines that have come; None at the end of the pipe."""
+        try:
+            data = os.read(self.status, 1 << 20)
+        except BlockingIOError:
+            return []
+        if not data:
+            return None
+        *whole, self._partial = (self._partial + data).split(b"\n")
+        return [json.loads(line) for line in whole]
+
+    def reap(self) -> int | None:
+        """The exit code once the process has ended (minus the signal's number), else None."""
+        return self._popen.poll()
+
+    def close(self) -> None:
+        """Close pipes and pidfd of a process that has ended."""
+        for pipe in (self._popen.stdin, self._popen.stdout):
+            if pipe is not None:
+                try:
+                    pipe.close()
+                except OSError:
+                    pass
+        super().close()
+
+
+def ending(code: int | None) -> str:
+    """How a process ended, in words."""
+    if code is None:
+        return "is gone"
+    if code < 0:
+        return f"was ended by {signal.Signals(-code).name}"
+    return f"exited with code {code}"

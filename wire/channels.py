@@ -1,0 +1,126 @@
+"""The channels of a recording: one table of topics, fields and units, read by recorder and analysis alike.
+
+Messages are flat JSON objects with a JSON Schema, so that Foxglove, PlotJuggler and others can plot them. Every
+message begins with `tick` and `time_s` = tick * period; the log time is the same in nanoseconds. All instants
+and durations of the wall clock are in channels whose last part is `timing`; they are nanoseconds since the
+`epoch_ns` of the metadata, on the monotonic clock that the processes of a machine share.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+FORMAT_VERSION = 1
+SHAPE_POINTS = 33
+"""Points along the arm in /plant/shape, equally spaced in arclength, root and tip included."""
+METADATA = "octarm"
+SUMMARY = "summary"
+
+MEASUREMENT = ("velocity_y_m_per_s", "curvature_per_m")
+STATE = ("velocity_x_m_per_s", "velocity_y_m_per_s", "strain", "curvature_per_m")
+COMMAND = ("force_n_per_m",)
+TIP = ("x_m", "y_m", "error_m")
+ENERGY = ("kinetic_j", "axial_j", "bending_j")
+REGULATED = ("mean_velocity_y_m_per_s", "mean_curvature_per_m")
+SHAPE = tuple(f"{axis}{i:02d}_m" for i in range(SHAPE_POINTS) for axis in "xy")
+SWEEP_TIMING = ("started_wall_ns", "duration_wall_ns", "advance_wall_ns")
+"""From the first measurement sent to the last command received by the plant; and the arm's own integration."""
+EVENT = ("level", "name", "message")
+
+_TEXT = {"level", "name", "message"}
+_DESCRIPTION = {
+    "force_n_per_m": "transverse load per length that the plant applies from this tick to the next",
+    "error_m": "distance of the tip from the setpoint's",
+    "strain": "axial strain, dimensionless",
+}
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One topic and its fields after `tick` and `time_s`."""
+
+    topic: str
+    fields: tuple[str, ...]
+
+    @property
+    def schema_name(self) -> str:
+        """Name of the schema: the topic without node numbers."""
+        parts = [p for p in self.topic.split("/") if p and not p.isdigit()]
+        return "octarm." + ".".join(parts)
+
+    @property
+    def schema(self) -> bytes:
+        """JSON Schema of a message."""
+        properties: dict[str, dict[str, str]] = {
+            "tick": {"type": "integer"},
+            "time_s": {"type": "number"},
+        }
+        for field in self.fields:
+            kind = "string" if field in _TEXT else "number"
+            properties[field] = {"type": kind}
+            if field in _DESCRIPTION:
+                properties[field]["description"] = _DESCRIPTION[field]
+        schema = {
+            "type": "object",
+            "title": self.schema_name,
+            "properties": properties,
+            "required": list(properties),
+        }
+        return json.dumps(schema, separators=(",", ":")).encode()
+
+
+def label(index: int, nodes: int) -> str:
+    """A node's number as topics have it: zero-padded, at least two digits."""
+    return f"{index:0{max(2, len(str(nodes - 1)))}d}"
+
+
+def timing_fields(index: int, nodes: int) -> tuple[str, ...]:
+    """Instants of one node's tick: what it does not receive is left out."""
+    return (
+        "measurement_received_wall_ns",
+        *(("forward_received_wall_ns",) if index > 0 else ()),
+        *(("backward_received_wall_ns",) if index < nodes - 1 else ()),
+        "command_sent_wall_ns",
+    )
+
+
+def node_channels(index: int, nodes: int, forward: int, backward: int) -> list[Channel]:
+    """A node's channels in the order of the numbers in its telemetry rows.
+
+    `forward` and `backward` are the numbers of doubles in the sums that it receives. A channel without
+    numbers (no neighbour on that side) is left out.
+    """
+    root = f"/node/{label(index, nodes)}"
+    channels = [
+        Channel(f"{root}/measurement", MEASUREMENT),
+        Channel(f"{root}/estimate", STATE),
+        Channel(f"{root}/command", COMMAND),
+    ]
+    if index > 0:
+        channels.append(Channel(f"{root}/forward_sum", tuple(f"c{i}" for i in range(forward))))
+    if index < nodes - 1:
+        channels.append(Channel(f"{root}/backward_sum", tuple(f"d{i}" for i in range(backward))))
+    channels.append(Channel(f"{root}/timing", timing_fields(index, nodes)))
+    return channels
+
+
+def plant_channels(nodes: int) -> list[Channel]:
+    """The plant's channels in the order of the numbers in its telemetry rows."""
+    return [
+        *(Channel(f"/plant/truth/{label(i, nodes)}", STATE) for i in range(nodes)),
+        Channel("/plant/tip", TIP),
+        Channel("/plant/energy", ENERGY),
+        Channel("/plant/regulated", REGULATED),
+        Channel("/plant/shape", SHAPE),
+        Channel("/sweep/timing", SWEEP_TIMING),
+    ]
+
+
+EVENTS = Channel("/event", EVENT)
+
+
+def width(channels: Sequence[Channel]) -> int:
+    """Numbers in a telemetry row with these channels."""
+    return sum(len(channel.fields) for channel in channels)

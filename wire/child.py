@@ -1,0 +1,172 @@
+"""The manners of a child process: status lines to the launcher, stop signals, and no life after the launcher.
+
+A child writes one JSON object a line to its standard output; the launcher holds the other end. Its standard
+input is the lifeline: when it is closed, the launcher is gone and the child ends. Linux's parent-death signal
+does the same for a parent that dies without a word.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import select
+import shutil
+import signal
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+_PR_SET_PDEATHSIG = 1
+_PR_SET_NAME = 15
+LINE_LIMIT = 4000
+"""Bytes of a status line: writes up to 4096 bytes (PIPE_BUF) by many processes never mix."""
+
+
+def die_with_parent(parent: int) -> None:
+    """Ask the kernel for SIGTERM when the parent dies; ends at once if it is dead already."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    if os.getppid() != parent:
+        raise SystemExit(0)
+
+
+def name_process(name: str) -> None:
+    """Name shown by `ps` and `top` (15 characters)."""
+    ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode()[:15], 0, 0, 0)
+
+
+def send_status(fd: int, name: str, event: str, **fields: Any) -> None:
+    """Write one status line; a launcher that is gone is not an error here (the lifeline tells)."""
+    line = json.dumps({"from": name, "event": event, **fields}, allow_nan=False).encode()
+    if len(line) > LINE_LIMIT:
+        short = {k: (v[:1500] if isinstance(v, str) else v) for k, v in fields.items()}
+        line = json.dumps({"from": name, "event": event, **short}).encode()
+        if len(line) > LINE_LIMIT:
+            line = json.dumps({"from": name, "event": event}).encode()
+    try:
+        os.write(fd, line + b"\n")
+    except OSError:
+        return
+
+
+class Child:
+    """What the main thread of a node, plant or recorder waits on: lifeline, signals, wake-ups, time.
+
+    `name` is how the launcher calls the process ("node 3"); `directory` the run's private directory, which a
+    child that finds the launcher dead removes (whoever is last succeeds).
+    """
+
+    def __init__(self, name: str, *, control: int, status: int, directory: str | None) -> None:
+        self.name = name
+        self.stopping = False
+        """Set by SIGINT, SIGTERM or the end of the lifeline."""
+        self.orphaned = False
+        """Set when the launcher is gone."""
+        self.directory = directory
+        self._status = status
+        self._control = control
+        self._buffer = b""
+        self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._poll = select.poll()
+        self._poll.register(self._read, select.POLLIN)
+
+    def install(self, *, reads_control: bool) -> None:
+        """Install signal handlers and watch the lifeline; `reads_control`: lines come on it too."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+        signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+        signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
+        if self._control >= 0:
+            self._poll.register(self._control, select.POLLIN if reads_control else 0)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.stopping = True
+
+    def wake(self) -> None:
+        """End the main thread's wait; callable from any thread."""
+        try:
+            os.write(self._write, b"w")
+        except BlockingIOError:
+            return  # the pipe is full of wake-ups already
+
+    def wait(self, seconds: float | None) -> list[dict[str, Any]]:
+        """Wait for a wake-up, a signal, the lifeline or the time; returns the control messages that came."""
+        return [json.loads(line) for line in self.wait_lines(seconds)]
+
+    def wait_lines(self, seconds: float | None) -> list[bytes]:
+        """The same with the control lines as they came."""
+        timeout = None if seconds is None else max(0, int(seconds * 1000 + 0.999))
+        *out, self._buffer = self._buffer.split(b"\n")
+        if out:
+            timeout = 0
+        for fd, event in self._poll.poll(timeout):
+            if fd == self._read:
+                try:
+                    os.read(self._read, 4096)
+                except BlockingIOError:
+                    pass
+            elif event & select.POLLIN:
+                out += self._control_lines()
+            elif event & (select.POLLHUP | select.POLLERR | select.POLLNVAL):
+                self._lost()
+        return out
+
+    def _control_lines(self) -> list[bytes]:
+        data = os.read(self._control, 1 << 20)
+        if not data:
+            self._lost()
+            return []
+        *lines, self._buffer = (self._buffer + data).split(b"\n")
+        return lines
+
+    def _lost(self) -> None:
+        self._poll.unregister(self._control)
+        self.orphaned = True
+        self.stopping = True
+
+    def configuration(self) -> bytes:
+        """The first line of the control pipe, waited for; SystemExit if the launcher goes before it came."""
+        while b"\n" not in self._buffer:
+            piece = os.read(self._control, 1 << 20)
+            if not piece:
+                raise SystemExit(0)
+            self._buffer += piece
+        line, _, self._buffer = self._buffer.partition(b"\n")
+        return line
+
+    def status(self, event: str, **fields: Any) -> None:
+        """Tell the launcher."""
+        send_status(self._status, self.name, event, **fields)
+
+    def leave(self, endpoints: list[str]) -> None:
+        """Remove this process's sockets, and the whole private directory if the launcher is dead."""
+        remove_sockets(endpoints)
+        if self.orphaned and self.directory is not None:
+            shutil.rmtree(self.directory, ignore_errors=True)
+
+
+def remove_sockets(endpoints: list[str]) -> None:
+    """Remove the files of unix socket endpoints: the socket and Zenoh's lock beside it."""
+    for endpoint in endpoints:
+        protocol, _, path = endpoint.partition("/")
+        if protocol == "unixsock-stream":
+            for file in (path, path + ".lock"):
+                Path(file).unlink(missing_ok=True)
+
+
+class Deadline:
+    """A point on the monotonic clock."""
+
+    def __init__(self, seconds: float) -> None:
+        self.at = time.monotonic() + seconds
+
+    @property
+    def left(self) -> float:
+        """Seconds until it, zero when passed."""
+        return max(0.0, self.at - time.monotonic())
+
+    @property
+    def passed(self) -> bool:
+        """Whether it is over."""
+        return time.monotonic() >= self.at

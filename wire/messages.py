@@ -1,0 +1,242 @@
+"""The messages on the wire: seven fields in a msgpack list, refused with a named reason when anything is off.
+
+Data flow: plant -> node (measurement), node -> node (running sums), node -> plant (command), every process
+-> recorder (telemetry, counters), plant -> all (stop).
+
+A message is `[version, kind, run, tick, sender, setpoint, payload]`: five integers that say what it is and
+where it belongs, the index of the active setpoint (theory, section 5: one set of sweep matrices a setpoint),
+and the payload. The payload of the control kinds is a list of doubles; that of the others is stated at their
+encoder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from enum import IntEnum, StrEnum
+from typing import Any, NamedTuple
+
+import msgpack
+import numpy as np
+import numpy.typing as npt
+
+VERSION = 1
+PLANT = -1
+"""The sender number of the plant; nodes send their index 0..n-1."""
+FIELDS = 7
+LONGEST_TEXT = 2000
+"""Characters that a stop message carries at most, so that its status line stays within one pipe write."""
+LARGEST_TICK = 2**53
+"""Ticks beyond this could not be told apart in a recording, whose numbers are doubles."""
+
+_pack: Callable[[object], bytes] = msgpack.Packer(autoreset=True).pack
+_FLOATS = {float}
+
+
+class Kind(IntEnum):
+    """What a message carries."""
+
+    MEASUREMENT = 1
+    COMMAND = 2
+    FORWARD_SUM = 3
+    BACKWARD_SUM = 4
+    TELEMETRY = 5
+    COUNTERS = 6
+    STOP = 7
+
+
+class Reason(StrEnum):
+    """Why a message was refused; the counters are kept by these names."""
+
+    MALFORMED = "malformed"
+    VERSION = "version"
+    KIND = "kind"
+    RUN = "run"
+    SENDER = "sender"
+    TICK = "tick"
+    SETPOINT = "setpoint"
+    LENGTH = "length"
+    TYPE = "type"
+    NOT_FINITE = "not_finite"
+    STALE = "stale"
+    EARLY = "early"
+    DUPLICATE = "duplicate"
+
+
+class RejectedError(Exception):
+    """A message that was refused; `reason` is counted, the text says what was expected and what came."""
+
+    def __init__(self, reason: Reason, text: str) -> None:
+        super().__init__(f"{reason.value}: {text}")
+        self.reason = reason
+
+
+class Numbers(NamedTuple):
+    """A control message that passed every check."""
+
+    tick: int
+    sender: int
+    setpoint: int
+    values: list[float]
+
+
+class Batch(NamedTuple):
+    """Telemetry: one row a tick, beginning with `tick`; shape (rows, columns)."""
+
+    tick: int
+    sender: int
+    rows: npt.NDArray[np.float64]
+
+
+class Stop(NamedTuple):
+    """The end of a run: `cause` is 'finished', 'interrupted' or 'safety', `tick` the first one not done."""
+
+    tick: int
+    cause: str
+    text: str
+
+
+def run_tag(run_id: str) -> int:
+    """The 63-bit number that stands for a run id on the wire."""
+    return int.from_bytes(hashlib.sha256(run_id.encode()).digest()[:8], "big") >> 1
+
+
+def encode_numbers(
+    kind: Kind, run: int, tick: int, sender: int, setpoint: int, values: Sequence[float]
+) -> bytes:
+    """Encode a measurement, command, forward or backward sum; `values` are Python floats."""
+    return _pack([VERSION, int(kind), run, tick, sender, setpoint, values])
+
+
+def encode_batch(run: int, tick: int, sender: int, rows: npt.NDArray[np.float64]) -> bytes:
+    """Encode telemetry rows of shape (rows, columns), little-endian doubles in row order."""
+    payload = [rows.shape[1], rows.astype("<f8", copy=False).tobytes()]
+    return _pack([VERSION, int(Kind.TELEMETRY), run, tick, sender, 0, payload])
+
+
+def encode_counters(run: int, tick: int, sender: int, counters: Mapping[str, int]) -> bytes:
+    """Encode the final counters of a process: a list of [name, number]; `tick` is the first one not done."""
+    payload = [[name, value] for name, value in counters.items()]
+    return _pack([VERSION, int(Kind.COUNTERS), run, tick, sender, 0, payload])
+
+
+def encode_stop(run: int, stop: Stop) -> bytes:
+    """Encode the plant's order to stop."""
+    text = stop.text[:LONGEST_TEXT]
+    return _pack([VERSION, int(Kind.STOP), run, stop.tick, PLANT, 0, [stop.cause, text]])
+
+
+def decode_numbers(
+    raw: bytes, kind: Kind, run: int, sender: int, lengths: Sequence[int]
+) -> Numbers:
+    """Decode and check one control message; RejectedError names the first thing that is wrong.
+
+    `lengths` gives for each setpoint how many doubles such a message carries (a sum's rank may differ).
+    """
+    tick, came_from, setpoint, values = _header(raw, kind, run)
+    if came_from != sender:
+        raise RejectedError(Reason.SENDER, f"expected sender {sender}, got {came_from}")
+    if not 0 <= setpoint < len(lengths):
+        raise RejectedError(Reason.SETPOINT, f"expected 0..{len(lengths) - 1}, got {setpoint}")
+    if type(values) is not list:
+        raise RejectedError(Reason.TYPE, f"expected a list of doubles, got {_name(values)}")
+    if len(values) != lengths[setpoint]:
+        raise RejectedError(
+            Reason.LENGTH, f"expected {lengths[setpoint]} doubles, got {len(values)}"
+        )
+    if values:
+        if set(map(type, values)) != _FLOATS:
+            raise RejectedError(Reason.TYPE, "expected doubles only")
+        # One sum decides the usual case; it may overflow where every term is finite.
+        if not math.isfinite(sum(values)) and not all(map(math.isfinite, values)):
+            raise RejectedError(Reason.NOT_FINITE, f"got {values}")
+    return Numbers(tick, came_from, setpoint, values)
+
+
+def decode_batch(raw: bytes, run: int, columns: Mapping[int, int]) -> Batch:
+    """Decode telemetry; `columns` gives for each known sender its number of columns."""
+    tick, sender, _, payload = _header(raw, Kind.TELEMETRY, run)
+    if sender not in columns:
+        raise RejectedError(Reason.SENDER, f"unknown sender {sender}")
+    if type(payload) is not list or len(payload) != 2 or type(payload[1]) is not bytes:
+        raise RejectedError(Reason.TYPE, "expected [columns, bytes]")
+    width, data = payload
+    if type(width) is not int or width != columns[sender]:
+        raise RejectedError(Reason.LENGTH, f"expected {columns[sender]} columns, got {width!r}")
+    if not data or len(data) % (8 * width):
+        raise RejectedError(Reason.LENGTH, f"{len(data)} bytes are no whole number of rows")
+    rows = np.frombuffer(data, dtype="<f8").reshape(-1, width)
+    if not np.isfinite(rows).all():
+        raise RejectedError(Reason.NOT_FINITE, f"telemetry of sender {sender} from tick {tick}")
+    return Batch(tick, sender, rows)
+
+
+def decode_counters(raw: bytes, run: int) -> tuple[int, int, dict[str, int]]:
+    """Decode final counters; returns (sender, first tick not done, counters)."""
+    tick, sender, _, payload = _header(raw, Kind.COUNTERS, run)
+    if type(payload) is not list:
+        raise RejectedError(Reason.TYPE, f"expected a list of counters, got {_name(payload)}")
+    out: dict[str, int] = {}
+    for item in payload:
+        if type(item) is not list or len(item) != 2:
+            raise RejectedError(Reason.TYPE, "expected [name, number]")
+        name, value = item
+        if type(name) is not str or type(value) is not int or value < 0:
+            raise RejectedError(Reason.TYPE, "expected [name, number]")
+        out[name] = value
+    return sender, tick, out
+
+
+def decode_stop(raw: bytes, run: int) -> Stop:
+    """Decode the order to stop; only the plant may give it."""
+    tick, sender, _, payload = _header(raw, Kind.STOP, run)
+    if sender != PLANT:
+        raise RejectedError(Reason.SENDER, f"expected the plant, got {sender}")
+    if type(payload) is not list or [type(p) for p in payload] != [str, str]:
+        raise RejectedError(Reason.TYPE, "expected [cause, text]")
+    cause, text = payload
+    if cause not in ("finished", "interrupted", "safety"):
+        raise RejectedError(Reason.TYPE, f"unknown cause {cause[:40]!r}")
+    return Stop(tick, cause, text)
+
+
+def kind_of(raw: bytes) -> Kind:
+    """The kind of a message without checking the rest (the recorder sorts by it)."""
+    fields = _unpack(raw)
+    try:
+        return Kind(fields[1])
+    except ValueError:
+        raise RejectedError(Reason.KIND, f"unknown kind {fields[1]!r}"[:80]) from None
+
+
+def _unpack(raw: bytes) -> list[Any]:
+    try:
+        fields = msgpack.unpackb(raw)
+    except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
+        raise RejectedError(Reason.MALFORMED, f"not msgpack ({type(error).__name__})") from None
+    if type(fields) is not list or len(fields) != FIELDS:
+        raise RejectedError(Reason.MALFORMED, f"expected a list of {FIELDS} fields")
+    return fields
+
+
+def _header(raw: bytes, kind: Kind, run: int) -> tuple[int, int, int, Any]:
+    """Check the fields that every kind has; returns tick, sender, setpoint, payload."""
+    version, came_kind, came_run, tick, sender, setpoint, payload = _unpack(raw)
+    if type(version) is not int or version != VERSION:
+        raise RejectedError(Reason.VERSION, f"expected version {VERSION}, got {version!r}"[:80])
+    if type(came_kind) is not int or came_kind != kind:
+        raise RejectedError(Reason.KIND, f"expected kind {int(kind)}, got {came_kind!r}"[:80])
+    if type(came_run) is not int or came_run != run:
+        raise RejectedError(Reason.RUN, "the message belongs to another run")
+    if type(tick) is not int or not 0 <= tick <= LARGEST_TICK:
+        raise RejectedError(Reason.TICK, f"expected a tick number, got {tick!r}"[:80])
+    if type(sender) is not int:
+        raise RejectedError(Reason.SENDER, f"expected a number, got {sender!r}"[:80])
+    if type(setpoint) is not int:
+        raise RejectedError(Reason.SETPOINT, f"expected an index, got {setpoint!r}"[:80])
+    return tick, sender, setpoint, payload
+
+
+def _name(value: object) -> str:
+    return type(value).__name__

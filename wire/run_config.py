@@ -1,0 +1,222 @@
+"""What the launcher tells each process of a run, as JSON: the run itself and one configuration a process.
+
+Made once by the launcher, sent to the children as one line each (or a file, for a node started by hand), and
+written into the recording, so that a run can be understood and recomputed from its recording alone.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import math
+import types
+import typing
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from wire.errors import UsageError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class DisturbanceConfig:
+    """A built-in disturbance of the plant; the unit of the amplitude is its own (plant.disturbance)."""
+
+    name: str = "none"
+    amplitude: float = 1.0
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """Standard deviations of the sensors' noise."""
+
+    velocity_y_m_per_s: float = 0.0
+    curvature_per_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """One run: everything that its numbers depend on, apart from the gains artefact's content."""
+
+    run_id: str
+    nodes: int
+    spacing: str
+    faces_m: tuple[float, ...]
+    """Segment boundaries from root to tip, n + 1 of them."""
+    tick_s: float
+    ticks: int
+    seed: int
+    setpoint: str
+    setpoint_names: tuple[str, ...]
+    initial: str
+    disturbance: DisturbanceConfig
+    noise: NoiseConfig
+    plant_cells: int
+    artefact_path: str
+    artefact_sha256: str
+    initial_estimates: tuple[tuple[float, ...], ...]
+    """xh(0), one (v_x, v_y, e, k) a node."""
+    initial_commands_n_per_m: tuple[float, ...]
+    """u(0), one a node."""
+    energy_weights: tuple[tuple[float, ...], ...]
+    """(n, 4), J per unit squared: sum of w x^2 is the energy of a state deviation x."""
+
+    def __post_init__(self) -> None:
+        if self.nodes < 2:
+            raise UsageError(f"nodes: expected at least 2, got {self.nodes}")
+        if self.ticks < 1:
+            raise UsageError(f"ticks: expected at least 1, got {self.ticks}")
+        if not (math.isfinite(self.tick_s) and self.tick_s > 0.0):
+            raise UsageError(f"tick_s: expected a positive number of seconds, got {self.tick_s!r}")
+        if len(self.faces_m) != self.nodes + 1:
+            raise UsageError(
+                f"faces_m: expected {self.nodes + 1} numbers, got {len(self.faces_m)}"
+            )
+        if self.setpoint not in self.setpoint_names:
+            raise UsageError(f"setpoint {self.setpoint!r}: not in {self.setpoint_names}")
+
+    @property
+    def setpoint_index(self) -> int:
+        """Position of the active setpoint among `setpoint_names`."""
+        return self.setpoint_names.index(self.setpoint)
+
+
+@dataclass(frozen=True)
+class LinkConfig:
+    """Where a process listens and whom it dials, and the times that it waits."""
+
+    listen: tuple[str, ...]
+    connect: tuple[str, ...]
+    directory: str | None
+    """The run's private directory of sockets, None over TCP or when the user owns it."""
+    deadline_s: float
+    """Longest wait within a tick before the arm is stopped."""
+    epoch_ns: int
+    """Zero of the recorded wall-clock instants, on the monotonic clock that all processes share."""
+    cpu: int | None
+    """The core to run on, None to leave it to the scheduler."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.deadline_s) and self.deadline_s > 0.0):
+            raise UsageError(f"deadline_s: expected a positive number, got {self.deadline_s!r}")
+
+
+@dataclass(frozen=True)
+class NodeConfig:
+    """What one node needs: its place in the chain, its matrices, its links."""
+
+    run_id: str
+    index: int
+    nodes: int
+    ticks: int
+    setpoint: int
+    """Index of the active setpoint."""
+    batch_ticks: int
+    """Telemetry is sent every so many ticks."""
+    links: LinkConfig
+    factors: dict[str, Any]
+    """The node's sweep factors and initial values, see wire.factors."""
+
+    def __post_init__(self) -> None:
+        if self.nodes < 2 or not 0 <= self.index < self.nodes:
+            raise UsageError(f"index: expected 0..{self.nodes - 1}, got {self.index}")
+        if self.batch_ticks < 1:
+            raise UsageError(f"batch_ticks: expected at least 1, got {self.batch_ticks}")
+
+
+@dataclass(frozen=True)
+class PlantConfig:
+    """What the plant needs: the run, the arm and setpoint of the artefact (as JSON), its links."""
+
+    run: RunConfig
+    arm: dict[str, Any]
+    setpoint: dict[str, Any]
+    batch_ticks: int
+    links: LinkConfig
+
+
+@dataclass(frozen=True)
+class RecorderConfig:
+    """What the recorder needs: the run, the file, what to attach, and how wide each node's records are."""
+
+    run: RunConfig
+    path: str
+    forward_widths: tuple[int, ...]
+    """Numbers in the forward sum that each node receives (0 at the root)."""
+    backward_widths: tuple[int, ...]
+    """Numbers in the backward sum that each node receives (0 at the tip)."""
+    flush_s: float
+    """A killed run loses at most this much wall-clock time of its recording."""
+    metadata: dict[str, str]
+    attachments: dict[str, str]
+    """Name and text of each attached file."""
+    links: LinkConfig
+
+
+def dumps(config: Any) -> str:
+    """A configuration as one line of JSON; bytes become {"base64": text}."""
+    data = dataclasses.asdict(config)
+    return json.dumps(data, separators=(",", ":"), allow_nan=False, default=_bytes_out)
+
+
+def _bytes_out(value: Any) -> dict[str, str]:
+    if not isinstance(value, bytes):
+        raise TypeError(f"{type(value).__name__} has no place in a configuration")
+    return {"base64": base64.b64encode(value).decode()}
+
+
+def _bytes_in(data: dict[str, Any]) -> Any:
+    if data.keys() == {"base64"}:
+        return base64.b64decode(data["base64"], validate=True)
+    return data
+
+
+def loads(cls: type[T], text: str | bytes, where: str) -> T:
+    """A configuration from JSON; UsageError names the field that is missing, unknown or of a wrong type."""
+    try:
+        data = json.loads(text, object_hook=_bytes_in)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise UsageError(f"{where}: not JSON ({error})") from None
+    return typing.cast(T, _build(cls, data, where))
+
+
+def _build(cls: Any, data: Any, where: str) -> Any:
+    if not isinstance(data, dict):
+        raise UsageError(f"{where}: expected an object, got {type(data).__name__}")
+    hints = typing.get_type_hints(cls)
+    if missing := sorted(hints.keys() - data.keys()):
+        raise UsageError(f"{where}: {missing[0]} is missing")
+    if unknown := sorted(data.keys() - hints.keys()):
+        raise UsageError(f"{where}: {unknown[0]!r} is not a known field")
+    return cls(**{key: _value(hints[key], data[key], f"{where}.{key}") for key in hints})
+
+
+def _value(hint: Any, data: Any, where: str) -> Any:
+    origin = typing.get_origin(hint)
+    if dataclasses.is_dataclass(hint):
+        return _build(hint, data, where)
+    if origin in (typing.Union, types.UnionType):
+        if data is None:
+            return None
+        return _value(next(a for a in typing.get_args(hint) if a is not type(None)), data, where)
+    if origin is tuple:
+        if not isinstance(data, list):
+            raise UsageError(f"{where}: expected a list, got {type(data).__name__}")
+        inner = typing.get_args(hint)[0]
+        return tuple(_value(inner, item, f"{where}[{i}]") for i, item in enumerate(data))
+    if origin is dict:
+        if not isinstance(data, dict):
+            raise UsageError(f"{where}: expected an object, got {type(data).__name__}")
+        inner = typing.get_args(hint)[1]
+        return {k: _value(inner, v, f"{where}.{k}") for k, v in data.items()}
+    if hint is Any:
+        return data
+    if hint is float and type(data) is int:
+        data = float(data)
+    if type(data) is not hint:
+        raise UsageError(f"{where}: expected {hint.__name__}, got {data!r}"[:300])
+    if hint is float and not math.isfinite(data):
+        raise UsageError(f"{where}: expected a finite number, got {data!r}")
+    return data
