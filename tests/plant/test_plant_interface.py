@@ -111,7 +111,7 @@ def test_disturbance_and_command_push_alike() -> None:
 
 
 def test_disturbance_is_evaluated_at_the_time_of_the_tick() -> None:
-    """A step at 2 s leaves the arm alone until tick 4 of 0.5 s ends."""
+    """A step at 2.2 s leaves the arm alone through ticks 0 to 3 of 0.5 s and moves it in tick 4."""
     spec = DisturbanceSpec("step", 1e-2, start_s=2.2)
     plant = ArmPlant(PlantParameters(CHAPTER_ARM, TEN, 0.5, disturbance=spec))
     moved = []
