@@ -1,10 +1,13 @@
-"""`python -m node CONFIGURATION` starts one node by hand; `python -m node --zygote` is what the launcher uses."""
+"""`python -m node CONFIGURATION` starts one node by hand; `python -m node --zygote` is what the
+launcher uses."""
 
 from __future__ import annotations
 
 import os
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads would fight for two cores
+os.environ.setdefault(
+    "OPENBLAS_NUM_THREADS", "1"
+)  # before numpy: its threads would fight for two cores
 
 import argparse
 import sys
@@ -19,8 +22,12 @@ from wire.run_config import NodeConfig, loads
 def main() -> int:
     """Run one node, or the zygote; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m node", description=__doc__)
-    parser.add_argument("configuration", nargs="?", type=Path, help="JSON file written by the launcher")
-    parser.add_argument("--zygote", action="store_true", help="serve the launcher on standard input")
+    parser.add_argument(
+        "configuration", nargs="?", type=Path, help="JSON file written by the launcher"
+    )
+    parser.add_argument(
+        "--zygote", action="store_true", help="serve the launcher on standard input"
+    )
     parser.add_argument("--parent", type=int, default=os.getppid(), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.zygote:

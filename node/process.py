@@ -1,7 +1,9 @@
-"""The process of one segment: its Zenoh session, links to two neighbours and its segment of the plant only.
+"""The process of one segment: its Zenoh session, links to two neighbours and its segment of the
+plant only.
 
-Messages come on Zenoh's thread and are answered there; the main thread watches the time, the launcher and the
-end of the run. Telemetry goes to the recorder in batches, after the command of the tick has left.
+Messages come on Zenoh's thread and are answered there; the main thread watches the time, the
+launcher and the end of the run. Telemetry goes to the recorder in batches, after the command of the
+tick has left.
 """
 
 from __future__ import annotations
@@ -140,7 +142,8 @@ class NodeProcess:
             self._subscribers.append(listener)
 
     def _link(self, session: Any) -> Any | None:
-        """Wait until every publisher has its subscriber; returns the liveliness token, None if stopped."""
+        """Wait until every publisher has its subscriber; returns the liveliness token, None if
+        stopped."""
         index = self._config.index
         far = {
             "command": "the plant",
@@ -199,12 +202,13 @@ class NodeProcess:
             tick = self._segment.tick
         self._failure = (
             "deadline",
-            f"tick {tick}: node {self._config.index} waited {self._config.links.deadline_s:g} s for "
-            f"{' and '.join(missing)}",
+            f"tick {tick}: node {self._config.index} waited {self._config.links.deadline_s:g} s "
+            f"for {' and '.join(missing)}",
         )
 
     def _report(self) -> None:
-        """Send the rest of the telemetry and the counters; tell the launcher where the tick stood."""
+        """Send the rest of the telemetry and the counters; tell the launcher where the tick
+        stood."""
         with self._lock:
             tick = self._segment.tick
             missing = self._segment.missing() if self._segment.began_ns else []

@@ -1,8 +1,9 @@
-"""One segment's part of a tick: whatever arrives first, the sums go on as soon as they can, the command last.
+"""One segment's part of a tick: whatever arrives first, the sums go on as soon as they can, the
+command last.
 
-Between the process around it (`node.process`: Zenoh in, Zenoh out) and the mathematics (`node.sweep`). During
-tick k it holds xh_i(k) and u_i(k), takes y_i(k), c and d in any order, and gives c_{i+1}, d_{i-1} and u_i(k+1)
-(theory, section 5).
+Between the process around it (`node.process`: Zenoh in, Zenoh out) and the mathematics
+(`node.sweep`). During tick k it holds xh_i(k) and u_i(k), takes y_i(k), c and d in any order, and
+gives c_{i+1}, d_{i-1} and u_i(k+1) (theory, section 5).
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ class NotFiniteError(Exception):
 class Segment:
     """The state of one node within its tick. Not thread-safe: the process around it holds a lock.
 
-    `record` gets one row a tick: y (2), xh (4), u, c, d, then the instants on the monotonic clock, in ns, at
-    which the measurement, c (unless first), d (unless last) came and the command left.
+    `record` gets one row a tick: y (2), xh (4), u, c, d, then the instants on the monotonic clock,
+    in ns, at which the measurement, c (unless first), d (unless last) came and the command left.
     """
 
     def __init__(

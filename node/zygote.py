@@ -1,7 +1,8 @@
-"""The process that all nodes of a run on this machine are forked from: modules are loaded once, not n times.
+"""The process that all nodes of a run on this machine are forked from: modules are loaded once, not
+n times.
 
-The launcher writes one node configuration a line to its standard input; each becomes a child process. Births
-and deaths go to the launcher as status lines.
+The launcher writes one node configuration a line to its standard input; each becomes a child
+process. Births and deaths go to the launcher as status lines.
 """
 
 from __future__ import annotations

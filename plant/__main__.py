@@ -1,4 +1,5 @@
-"""`python -m plant`: started by the launcher, configured by the first line of its standard input."""
+"""`python -m plant`: started by the launcher, configured by the first line of its standard
+input."""
 
 from __future__ import annotations
 

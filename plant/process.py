@@ -1,7 +1,8 @@
-"""The plant's process: the emulated arm behind n sensors and n actuators, and the clock of a lock-step run.
+"""The plant's process: the emulated arm behind n sensors and n actuators, and the clock of a
+lock-step run.
 
-Each tick it sends y_i(k) to every node, waits for every u_i(k+1), then lets the arm move under u(k). Its Zenoh
-session is the router that hands the nodes' telemetry on to the recorder.
+Each tick it sends y_i(k) to every node, waits for every u_i(k+1), then lets the arm move under
+u(k). Its Zenoh session is the router that hands the nodes' telemetry on to the recorder.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 
 from plant.disturbance import DisturbanceSpec
 from plant.initial import initial_shape, legendre_profile
-from plant.model import Array, ArmPlant, PlantParameters
+from plant.model import ArmPlant, Array, PlantParameters
 from plant.noise import SensorNoise
 from wire import session as zsession
 from wire.artefact import Arm, Setpoint
@@ -69,9 +70,7 @@ class PlantProcess:
                 cells=run.plant_cells,
             )
         )
-        self._noise = SensorNoise(
-            run.seed, run.noise.velocity_y_m_per_s, run.noise.curvature_per_m
-        )
+        self._noise = SensorNoise(run.seed, run.noise.velocity_y_m_per_s, run.noise.curvature_per_m)
         self._tip = np.asarray(setpoint.tip_m)
         self._shape_at = np.linspace(0.0, arm.length_m, SHAPE_POINTS)
         self._regulated = _regulated_weights(np.asarray(run.faces_m))
@@ -96,7 +95,8 @@ class PlantProcess:
         self._orders: list[Stop] = []
 
     def run(self) -> ExitCode:
-        """Link up, wait for the launcher's start, run all ticks, end in order; returns the exit code."""
+        """Link up, wait for the launcher's start, run all ticks, end in order; returns the exit
+        code."""
         links = self._config.links
         if links.cpu is not None:
             os.sched_setaffinity(0, {links.cpu})
@@ -118,17 +118,13 @@ class PlantProcess:
         keys = self._keys
         for i in range(self._n):
             handler = self._receiver(i)
-            self._keep.append(
-                session.declare_subscriber(keys.command(i), zsession.direct(handler))
-            )
+            self._keep.append(session.declare_subscriber(keys.command(i), zsession.direct(handler)))
             self._publishers.append(zsession.control_publisher(session, keys.measurement(i)))
         self._stop_publisher = zsession.control_publisher(session, keys.stop)
         self._records = zsession.telemetry_publisher(session, keys.telemetry(PLANT))
         for publisher in (*self._publishers, self._records):
             self._keep.append(
-                publisher.declare_matching_listener(
-                    zsession.observe(lambda _: self._child.wake())
-                )
+                publisher.declare_matching_listener(zsession.observe(lambda _: self._child.wake()))
             )
         self._keep.append(
             session.liveliness().declare_subscriber(
@@ -145,7 +141,8 @@ class PlantProcess:
         self._child.wake()
 
     def _link(self) -> bool:
-        """Wait for every node's token, every link and the launcher's start; False if stopped before."""
+        """Wait for every node's token, every link and the launcher's start; False if stopped
+        before."""
         told: list[str] | None = None
         ready = False
         self._child.status("up")
@@ -223,7 +220,8 @@ class PlantProcess:
         return started_ns
 
     def _wait(self, k: int) -> Stop | None:
-        """Wait until every command of tick k is there; the order to stop if that does not happen."""
+        """Wait until every command of tick k is there; the order to stop if that does not
+        happen."""
         deadline = Deadline(self._config.links.deadline_s)
         while self._left:
             self._hear(self._child.wait(deadline.left))
@@ -252,7 +250,8 @@ class PlantProcess:
                 self._orders.append(Stop(0, message["cause"], message["text"]))
 
     def _finish(self, stop: Stop) -> None:
-        """Tell everybody, send the last records and counters, and stay until the launcher ends it."""
+        """Tell everybody, send the last records and counters, and stay until the launcher ends
+        it."""
         self._stop_publisher.put(encode_stop(self._keys.run, stop))
         self._flush(stop.tick)
         counters = (
@@ -305,6 +304,14 @@ class PlantProcess:
 
     # -- Zenoh's thread ---------------------------------------------------------------------------
 
+    def _check(self, tick: int, index: int) -> None:
+        """Refuse a command that is not this tick's first from its node."""
+        if tick != self._tick:
+            reason = Reason.STALE if tick < self._tick else Reason.EARLY
+            raise RejectedError(reason, f"expected tick {self._tick}, got {tick}")
+        if self._have[index]:
+            raise RejectedError(Reason.DUPLICATE, f"tick {tick} has the command of node {index}")
+
     def _receiver(self, index: int) -> Callable[[bytes], None]:
         run, lengths = self._keys.run, [1] * len(self._run.setpoint_names)
 
@@ -312,11 +319,7 @@ class PlantProcess:
             try:
                 message = decode_numbers(raw, Kind.COMMAND, run, index, lengths)
                 with self._lock:
-                    if message.tick != self._tick:
-                        reason = Reason.STALE if message.tick < self._tick else Reason.EARLY
-                        raise RejectedError(reason, f"expected {self._tick}, got {message.tick}")
-                    if self._have[index]:
-                        raise RejectedError(Reason.DUPLICATE, f"tick {self._tick}")
+                    self._check(message.tick, index)
                     self._have[index] = True
                     self._commands[index] = message.values[0]
                     self._received[index].add(raw)
@@ -337,11 +340,12 @@ class PlantProcess:
 
 
 def _regulated_weights(faces: Array) -> Array:
-    """Row weights (2, n) of the means over the arm of v_y (outer faces) and of the curvature (inner faces)."""
+    """Row weights (2, n) of the means over the arm of v_y (outer faces) and of the curvature (inner
+    faces)."""
     middle = 0.5 * (faces[1:] + faces[:-1])
     outer = np.diff(np.append(middle, faces[-1]))
     inner = np.diff(np.concatenate(([faces[0]], middle)))
-    return np.stack([outer, inner]) / (faces[-1] - faces[0])
+    return np.asarray(np.stack([outer, inner]) / (faces[-1] - faces[0]))
 
 
 def _nodes(indices: list[int]) -> str:

@@ -1,4 +1,5 @@
-"""`python -m recorder`: started by the launcher, configured by the first line of its standard input."""
+"""`python -m recorder`: started by the launcher, configured by the first line of its standard
+input."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Rows of many senders, batched and in any order, become one sequence by tick: what a recording needs.
+"""Rows of many senders, batched and in any order, become one sequence by tick: what a recording
+needs.
 
-Between the messages that the recorder receives and its file. A tick is handed out when every sender has given
-its row, so the order in the file does not depend on who was faster.
+Between the messages that the recorder receives and its file. A tick is handed out when every sender
+has given its row, so the order in the file does not depend on who was faster.
 """
 
 from __future__ import annotations

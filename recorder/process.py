@@ -1,7 +1,8 @@
-"""The recorder's process: telemetry of every process in, one MCAP file out, and the figures for the progress bar.
+"""The recorder's process: telemetry of every process in, one MCAP file out, and the figures for the
+progress bar.
 
-It is a client of the Zenoh router inside the plant's process and is never on the control path. Samples wait in
-a queue inside Zenoh until this process has time for them.
+It is a client of the Zenoh router inside the plant's process and is never on the control path.
+Samples wait in a queue inside Zenoh until this process has time for them.
 """
 
 from __future__ import annotations
@@ -68,7 +69,8 @@ class RecorderProcess:
         self._written = 0
         self._silent: set[int] = set()
         self._events: list[tuple[int, str, str, str]] = []
-        """Events whose tick is not written yet: they go into the file before the ticks that follow them."""
+        """Events whose tick is not written yet: they go into the file before the ticks that follow
+        them."""
 
     def run(self) -> ExitCode:
         """Record until the launcher says finish (or is gone); returns the exit code."""

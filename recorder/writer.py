@@ -1,7 +1,8 @@
-"""The recording's file: an MCAP with one JSON channel per kind of number and node, readable after any crash.
+"""The recording's file: an MCAP with one JSON channel per kind of number and node, readable after
+any crash.
 
-Last step of the data flow. Chunks are small and flushed on a stated period into an unbuffered file, so that a
-killed recorder loses no more than that.
+Last step of the data flow. Chunks are small and handed to the operating system on a stated period,
+so that a killed recorder loses no more than that.
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ _encode = msgspec.json.Encoder().encode
 
 
 class RecordingWriter:
-    """Writes ticks, events, metadata and attachments; `layout` gives the channels of each sender's rows."""
+    """Writes ticks, events, metadata and attachments; `layout` gives the channels of each sender's
+    rows."""
 
     def __init__(
         self, path: Path, tick_s: float, layout: Mapping[int, Sequence[Channel]], flush_s: float
     ) -> None:
-        self._file = path.open("xb", buffering=0)  # never over an existing recording
+        self._file = path.open("xb")  # never over an existing recording
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library="octarm")
         self._tick_s = tick_s
@@ -51,7 +53,7 @@ class RecordingWriter:
             self._schemas[schema] = self._writer.register_schema(
                 channel.schema_name, "jsonschema", schema
             )
-        return self._writer.register_channel(channel.topic, "json", self._schemas[schema])
+        return int(self._writer.register_channel(channel.topic, "json", self._schemas[schema]))
 
     def head(self, metadata: Mapping[str, str], attachments: Mapping[str, str]) -> None:
         """Write what is known before the run, and make it safe on disk."""
@@ -62,7 +64,8 @@ class RecordingWriter:
         self.flush()
 
     def tick(self, tick: int, rows: Mapping[int, Row]) -> None:
-        """Write one tick: the senders in the order of the layout, each row cut into its channels."""
+        """Write one tick: the senders in the order of the layout, each row cut into its
+        channels."""
         time_s = tick * self._tick_s
         log_time = self._log_time(tick)
         add = self._writer.add_message

@@ -1,11 +1,13 @@
-"""One child process of a run: started in a session of its own, spoken to in JSON lines, watched by its pidfd.
+"""One child process of a run: started in a session of its own, spoken to in JSON lines, watched by
+its pidfd.
 
-Between the conductor, which decides, and the operating system. Signals go through pidfds, so that a number that
-the system has given to somebody else is never hit.
+Between the conductor, which decides, and the operating system. Signals go through pidfds, so that a
+number that the system has given to somebody else is never hit.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
@@ -45,10 +47,8 @@ class Handle:
     def signal(self, number: signal.Signals) -> None:
         """Send a signal; nothing happens if the process has ended."""
         if self._fd >= 0:
-            try:
+            with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._fd, number)
-            except ProcessLookupError:
-                pass
 
     def close(self) -> None:
         """Give the pidfd back."""
@@ -71,7 +71,7 @@ class Process(Handle):
             stderr=log,
             cwd=PYTHON_ROOT,
             env=environment,
-            start_new_session=True,  # Ctrl-C is for the launcher, which then ends the others in order
+            start_new_session=True,  # Ctrl-C is for the launcher, which ends the others in order
         )
         super().__init__(name, self._popen.pid)
         if self._popen.stdin is None or self._popen.stdout is None:
@@ -112,10 +112,8 @@ class Process(Handle):
         """Close pipes and pidfd of a process that has ended."""
         for pipe in (self._popen.stdin, self._popen.stdout):
             if pipe is not None:
-                try:
+                with contextlib.suppress(OSError):
                     pipe.close()
-                except OSError:
-                    pass
         super().close()
 
 

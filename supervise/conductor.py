@@ -1,11 +1,14 @@
-"""Starts the processes of a run, waits for their links, watches them, and ends them whatever happens.
+"""Starts the processes of a run, waits for their links, watches them, and ends them whatever
+happens.
 
-One loop, one thread: pipes and pidfds of all children in a selector. It decides nothing about the arm; it only
-tells the plant to stop when a process fails, because only the plant can tell everybody at one tick.
+One loop, one thread: pipes and pidfds of all children in a selector. It decides nothing about the
+arm; it only tells the plant to stop when a process fails, because only the plant can tell everybody
+at one tick.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import selectors
 import signal
@@ -121,7 +124,8 @@ class Conductor:
     # -- the whole run ----------------------------------------------------------------------------
 
     def run(self) -> Outcome:
-        """Start, link, run, stop; raises OctarmError if it never came to the first tick, or Interrupted."""
+        """Start, link, run, stop; raises OctarmError if it never came to the first tick, or
+        Interrupted."""
         began = monotonic()
         self._spawn()
         self._wait_linked(Deadline(self._plan.start_timeout_s))
@@ -158,9 +162,7 @@ class Conductor:
 
     def _start(self, name: str, module: str, arguments: list[str]) -> Process:
         process = Process(name, module, arguments, self._log)
-        self._selector.register(
-            process.status, selectors.EVENT_READ, lambda: self._read(process)
-        )
+        self._selector.register(process.status, selectors.EVENT_READ, lambda: self._read(process))
         self._selector.register(process, selectors.EVENT_READ, lambda: self._gone(process))
         return process
 
@@ -298,9 +300,7 @@ class Conductor:
     def _recording_trouble(self) -> str:
         where = self._plan.recorder.path
         if "recorder" in self._ended:
-            return (
-                f"the recorder {self._ended['recorder']}: {where} ends early (it can be read up to there)"
-            )
+            return f"the recorder {self._ended['recorder']}: {where} can be read up to there"
         if self._closed is None:
             return f"the recorder did not finish: {where} may end early"
         run, lost = self._plan.run, int(self._closed["ticks_lost"])
@@ -370,10 +370,8 @@ class Conductor:
     def _read(self, process: Process) -> None:
         lines = process.lines()
         if lines is None:
-            try:
+            with contextlib.suppress(KeyError):
                 self._selector.unregister(process.status)
-            except KeyError:
-                pass
             return
         for line in lines:
             self._handle(line)

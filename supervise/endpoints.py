@@ -1,11 +1,12 @@
 """Where the processes of a run meet: unix sockets in a private directory, or loopback ports.
 
-First step of a start: the endpoints are chosen and checked here, before any process exists, so that a taken
-port or directory is one clear message.
+First step of a start: the endpoints are chosen and checked here, before any process exists, so that
+a taken port or directory is one clear message.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import os
@@ -47,18 +48,14 @@ class Endpoints:
         if self.private is not None:
             shutil.rmtree(self.private, ignore_errors=True)
         elif self._created is not None:
-            try:
+            with contextlib.suppress(OSError):  # somebody else put something there
                 self._created.rmdir()
-            except OSError:
-                pass  # somebody else put something there
         if self._lock >= 0:
             os.close(self._lock)
             self._lock = -1
 
 
-def choose(
-    nodes: int, transport: str, base_port: int | None, socket_dir: Path | None
-) -> Endpoints:
+def choose(nodes: int, transport: str, base_port: int | None, socket_dir: Path | None) -> Endpoints:
     """Choose and check the endpoints of a run; UsageError names what is taken or unusable."""
     if transport == "tcp":
         if socket_dir is not None:
@@ -88,7 +85,7 @@ def _longest(directory: Path, nodes: int) -> int:
 def _own_directory(nodes: int) -> Endpoints:
     base = Path(tempfile.gettempdir())
     if _longest(base / (PREFIX + "xxxxxxxx"), nodes) > LONGEST_SOCKET_PATH:
-        base = Path("/tmp")  # noqa: S108 - the directory made in it is private
+        base = Path("/tmp")
     _sweep(base)
     directory = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base))  # mode 0700
     lock = _lock(directory)
@@ -108,7 +105,8 @@ def _lock(directory: Path) -> int | None:
 
 
 def _sweep(base: Path) -> None:
-    """Remove what a run left whose processes were all killed at once: its directory is not locked."""
+    """Remove what a run left whose processes were all killed at once: its directory is not
+    locked."""
     for directory in base.glob(PREFIX + "*"):
         try:
             facts = directory.lstat()
@@ -125,8 +123,8 @@ def _given_directory(nodes: int, directory: Path) -> Endpoints:
     directory = directory.absolute()
     if _longest(directory, nodes) > LONGEST_SOCKET_PATH:
         raise UsageError(
-            f"--socket-dir {directory}: too long, a socket's path has at most {LONGEST_SOCKET_PATH} "
-            "bytes; give a shorter one or leave it out"
+            f"--socket-dir {directory}: too long, a socket's path has at most "
+            f"{LONGEST_SOCKET_PATH} bytes; give a shorter one or leave it out"
         )
     created = not directory.exists()
     try:
@@ -172,11 +170,11 @@ def _tcp(nodes: int, base_port: int | None) -> Endpoints:
     count = nodes  # the plant and nodes 0 .. n - 2
     if base_port is None:
         for _ in range(100):
-            base = random.randrange(10_000, HIGHEST_FREE_PORT - count)  # noqa: S311
+            base = random.randrange(10_000, HIGHEST_FREE_PORT - count)
             if not any(port_taken(port) for port in range(base, base + count)):
                 return _ports(base, nodes)
         raise UsageError(
-            f"--transport tcp: no {count} free loopback ports in a row found below "
+            f"--transport tcp: no {count} free loopback ports in a row below "
             f"{HIGHEST_FREE_PORT}; give --base-port or use --transport unix"
         )
     if not LOWEST_PORT <= base_port <= 65_536 - count:

@@ -1,12 +1,11 @@
-"""From the user's options to one configuration a process: gains read, deployed on n segments, everything checked.
+"""From the user's options to one configuration a process: gains read, deployed on n segments,
+everything checked.
 
 Nothing is started here, so every wrong value is refused before a process or a file exists.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
 import json
 import math
 import os
@@ -16,7 +15,6 @@ import time
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -26,6 +24,7 @@ from plant.grid import plant_cells
 from plant.initial import check_name
 from plant.noise import SensorNoise
 from supervise.endpoints import Endpoints
+from supervise.factors_file import factors_json
 from wire.artefact import GainsArtefact, digest, read_artefact
 from wire.channels import FORMAT_VERSION
 from wire.errors import UsageError
@@ -44,7 +43,8 @@ BATCH_TICKS = 32
 FLUSH_S = 0.5
 MOST_NODES = 1000
 CORES = 2
-"""Two sweeps run towards each other; more cores would only add wake-ups across cores (runtime figures)."""
+"""Two sweeps run towards each other; more cores would only add wake-ups across cores (runtime
+figures)."""
 DEFAULT_GAINS = Path(__file__).resolve().parent.parent / "examples" / "default.gains.json"
 
 
@@ -57,7 +57,7 @@ class RunOptions:
     ticks: int = 1200
     tick_s: float = 0.05
     seed: int = 1
-    setpoint: str | None = None
+    setpoint: str = "1"
     initial: str = "chapter"
     disturbance: str = "chapter"
     disturbance_amplitude: float = 1.0
@@ -122,29 +122,23 @@ def new_run_id() -> str:
     return f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
 
 
-def prepare(options: RunOptions) -> tuple[GainsArtefact, Deployment, str]:
-    """Read the gains and deploy them; returns artefact, deployment and the active setpoint's name.
-
-    Raises UsageError or GainsRefusedError.
-    """
+def prepare(options: RunOptions) -> tuple[GainsArtefact, Deployment]:
+    """Read the gains and deploy them; raises UsageError or GainsRefusedError."""
     artefact = read_artefact(options.gains)
-    name = options.setpoint
-    if name is None:
-        name = artefact.setpoints[-1].name if len(artefact.setpoints) > 1 else artefact.setpoints[0].name
-    artefact.setpoint_index(name)
-    deployment = deploy(artefact, options.nodes, options.tick_s, options.spacing)
-    return artefact, deployment, name
+    artefact.setpoint_index(options.setpoint)
+    return artefact, deploy(artefact, options.nodes, options.tick_s, options.spacing)
 
 
 def make_plan(
     options: RunOptions,
-    prepared: tuple[GainsArtefact, Deployment, str],
+    prepared: tuple[GainsArtefact, Deployment],
     endpoints: Endpoints,
     run_id: str,
     directory: Path,
 ) -> Plan:
     """Build every process's configuration."""
-    artefact, deployment, setpoint = prepared
+    artefact, deployment = prepared
+    setpoint = options.setpoint
     active = artefact.setpoint_index(setpoint)
     nodes = options.nodes
     run = RunConfig(
@@ -166,9 +160,7 @@ def make_plan(
         initial_estimates=tuple(
             tuple(f.initial_estimate[active].tolist()) for f in deployment.nodes
         ),
-        initial_commands_n_per_m=tuple(
-            float(f.initial_command[active]) for f in deployment.nodes
-        ),
+        initial_commands_n_per_m=tuple(float(f.initial_command[active]) for f in deployment.nodes),
         energy_weights=tuple(map(tuple, deployment.energy_weights.tolist())),
     )
     epoch_ns = time.monotonic_ns()
@@ -219,7 +211,7 @@ def make_plan(
             attachments={
                 "gains.json": options.gains.read_text(),
                 "run.json": dumps(run),
-                "deployment.json": _deployment_facts(deployment),
+                "deployment.json": factors_json(deployment),
             },
             links=links([], [endpoints.plant]),
         ),
@@ -231,7 +223,8 @@ def make_plan(
 
 
 def _cores(nodes: int) -> list[int | None]:
-    """The core of each node: neighbours share one; two runs on a large machine take different pairs."""
+    """The core of each node: neighbours share one; two runs on a large machine take different
+    pairs."""
     allowed = sorted(os.sched_getaffinity(0))
     start = secrets.randbelow(max(1, len(allowed) // CORES)) * CORES
     pair = allowed[start : start + CORES]
@@ -248,7 +241,7 @@ def _metadata(run: RunConfig, epoch_ns: int) -> dict[str, str]:
         "run_id": run.run_id,
         "artefact_sha256": run.artefact_sha256,
         "seed": str(run.seed),
-        "configuration": json.dumps(dataclasses.asdict(run)),
+        "run": dumps(run),
         "versions": json.dumps(versions),
         "epoch_ns": str(epoch_ns),
         "started_at": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
@@ -261,30 +254,3 @@ def _version(name: str) -> str:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return "unknown"
-
-
-def _deployment_facts(deployment: Deployment) -> str:
-    """Grid, ranks and every node's factors: with the measurements they give the run's numbers again."""
-    facts: dict[str, Any] = {
-        "faces_m": deployment.faces_m.tolist(),
-        "tick_s": deployment.tick_s,
-        "setpoint_names": list(deployment.setpoint_names),
-        "ranks_forward": [list(r) for r in deployment.ranks_forward],
-        "ranks_backward": [list(r) for r in deployment.ranks_backward],
-        "check": deployment.check,
-        "nodes": [_readable(f) for f in deployment.nodes],
-    }
-    facts["sha256"] = hashlib.sha256(json.dumps(facts["nodes"]).encode()).hexdigest()
-    return json.dumps(facts)
-
-
-def _readable(factors: Any) -> dict[str, Any]:
-    return {
-        "index": factors.index,
-        "initial_estimate": factors.initial_estimate.tolist(),
-        "initial_command": factors.initial_command.tolist(),
-        "setpoints": [
-            {f.name: getattr(one, f.name).tolist() for f in dataclasses.fields(one)}
-            for one in factors.setpoints
-        ],
-    }

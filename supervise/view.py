@@ -1,6 +1,8 @@
-"""What the user sees while a run goes on: a progress bar on a terminal, an occasional line elsewhere.
+"""What the user sees while a run goes on: a progress bar on a terminal, an occasional line
+elsewhere.
 
-Fed by the conductor; writes to standard error only, so that standard output stays free for the result.
+Fed by the conductor; writes to standard error only, so that standard output stays free for the
+result.
 """
 
 from __future__ import annotations

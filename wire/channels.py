@@ -1,9 +1,11 @@
-"""The channels of a recording: one table of topics, fields and units, read by recorder and analysis alike.
+"""The channels of a recording: one table of topics, fields and units, read by recorder and analysis
+alike.
 
-Messages are flat JSON objects with a JSON Schema, so that Foxglove, PlotJuggler and others can plot them. Every
-message begins with `tick` and `time_s` = tick * period; the log time is the same in nanoseconds. All instants
-and durations of the wall clock are in channels whose last part is `timing`; they are nanoseconds since the
-`epoch_ns` of the metadata, on the monotonic clock that the processes of a machine share.
+Messages are flat JSON objects with a JSON Schema, so that Foxglove, PlotJuggler and others can plot
+them. Every message begins with `tick` and `time_s` = tick * period; the log time is the same in
+nanoseconds. All instants and durations of the wall clock are in channels whose last part is
+`timing`; they are nanoseconds since the `epoch_ns` of the metadata, on the monotonic clock that the
+processes of a machine share.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ ENERGY = ("kinetic_j", "axial_j", "bending_j")
 REGULATED = ("mean_velocity_y_m_per_s", "mean_curvature_per_m")
 SHAPE = tuple(f"{axis}{i:02d}_m" for i in range(SHAPE_POINTS) for axis in "xy")
 SWEEP_TIMING = ("started_wall_ns", "duration_wall_ns", "advance_wall_ns")
-"""From the first measurement sent to the last command received by the plant; and the arm's own integration."""
+"""From the first measurement sent to the last command received by the plant; and the arm's own
+integration."""
 EVENT = ("level", "name", "message")
 
 _TEXT = {"level", "name", "message"}
@@ -89,8 +92,8 @@ def timing_fields(index: int, nodes: int) -> tuple[str, ...]:
 def node_channels(index: int, nodes: int, forward: int, backward: int) -> list[Channel]:
     """A node's channels in the order of the numbers in its telemetry rows.
 
-    `forward` and `backward` are the numbers of doubles in the sums that it receives. A channel without
-    numbers (no neighbour on that side) is left out.
+    `forward` and `backward` are the numbers of doubles in the sums that it receives. A channel
+    without numbers (no neighbour on that side) is left out.
     """
     root = f"/node/{label(index, nodes)}"
     channels = [

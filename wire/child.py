@@ -1,12 +1,14 @@
-"""The manners of a child process: status lines to the launcher, stop signals, and no life after the launcher.
+"""The manners of a child process: status lines to the launcher, stop signals, and no life after the
+launcher.
 
-A child writes one JSON object a line to its standard output; the launcher holds the other end. Its standard
-input is the lifeline: when it is closed, the launcher is gone and the child ends. Linux's parent-death signal
-does the same for a parent that dies without a word.
+A child writes one JSON object a line to its standard output; the launcher holds the other end. Its
+standard input is the lifeline: when it is closed, the launcher is gone and the child ends. Linux's
+parent-death signal does the same for a parent that dies without a word.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import json
 import os
@@ -51,10 +53,11 @@ def send_status(fd: int, name: str, event: str, **fields: Any) -> None:
 
 
 class Child:
-    """What the main thread of a node, plant or recorder waits on: lifeline, signals, wake-ups, time.
+    """What the main thread of a node, plant or recorder waits on: lifeline, signals, wake-ups,
+    time.
 
-    `name` is how the launcher calls the process ("node 3"); `directory` the run's private directory, which a
-    child that finds the launcher dead removes (whoever is last succeeds).
+    `name` is how the launcher calls the process ("node 3"); `directory` the run's private
+    directory, which a child that finds the launcher dead removes (whoever is last succeeds).
     """
 
     def __init__(self, name: str, *, control: int, status: int, directory: str | None) -> None:
@@ -80,7 +83,7 @@ class Child:
         if self._control >= 0:
             self._poll.register(self._control, select.POLLIN if reads_control else 0)
 
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         self.stopping = True
 
     def wake(self) -> None:
@@ -91,7 +94,8 @@ class Child:
             return  # the pipe is full of wake-ups already
 
     def wait(self, seconds: float | None) -> list[dict[str, Any]]:
-        """Wait for a wake-up, a signal, the lifeline or the time; returns the control messages that came."""
+        """Wait for a wake-up, a signal, the lifeline or the time; returns the control messages that
+        came."""
         return [json.loads(line) for line in self.wait_lines(seconds)]
 
     def wait_lines(self, seconds: float | None) -> list[bytes]:
@@ -102,10 +106,8 @@ class Child:
             timeout = 0
         for fd, event in self._poll.poll(timeout):
             if fd == self._read:
-                try:
+                with contextlib.suppress(BlockingIOError):
                     os.read(self._read, 4096)
-                except BlockingIOError:
-                    pass
             elif event & select.POLLIN:
                 out += self._control_lines()
             elif event & (select.POLLHUP | select.POLLERR | select.POLLNVAL):
@@ -126,7 +128,8 @@ class Child:
         self.stopping = True
 
     def configuration(self) -> bytes:
-        """The first line of the control pipe, waited for; SystemExit if the launcher goes before it came."""
+        """The first line of the control pipe, waited for; SystemExit if the launcher goes before it
+        came."""
         while b"\n" not in self._buffer:
             piece = os.read(self._control, 1 << 20)
             if not piece:
@@ -140,7 +143,8 @@ class Child:
         send_status(self._status, self.name, event, **fields)
 
     def leave(self, endpoints: list[str]) -> None:
-        """Remove this process's sockets, and the whole private directory if the launcher is dead."""
+        """Remove this process's sockets, and the whole private directory if the launcher is
+        dead."""
         remove_sockets(endpoints)
         if self.orphaned and self.directory is not None:
             shutil.rmtree(self.directory, ignore_errors=True)

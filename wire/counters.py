@@ -1,7 +1,7 @@
 """Counts of what a process really sent, received and refused; reported once, when the run ends.
 
-Neighbour messages are counted by their receivers, and a running checksum on both sides of every link shows
-that what was sent is what arrived.
+Neighbour messages are counted by their receivers, and a running checksum on both sides of every
+link shows that what was sent is what arrived.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from wire.messages import Reason
 
 
 class Flow:
-    """One direction of one kind of message: number, bytes, and the CRC-32 of everything in order."""
+    """One direction of one kind of message: number, bytes, and the CRC-32 of everything in
+    order."""
 
     __slots__ = ("bytes", "checksum", "messages")
 
@@ -47,7 +48,8 @@ class Rejections:
         self._counts[reason] = self._counts.get(reason, 0) + 1
 
     def report(self) -> dict[str, int]:
-        """The counts under `rejected_<reason>`, for the reasons that occurred, and `rejected_messages`."""
+        """The counts under `rejected_<reason>`, for the reasons that occurred, and
+        `rejected_messages`."""
         out = {f"rejected_{reason.value}": n for reason, n in sorted(self._counts.items())}
         out["rejected_messages"] = sum(self._counts.values())
         return out

@@ -1,7 +1,7 @@
 """The key expressions of a run: which process publishes what, and who subscribes to it.
 
-Every key begins with `octarm/<run>`, the run's tag in hexadecimal, so that two runs that met on one link by
-mistake would still not hear each other.
+Every key begins with `octarm/<run>`, the run's tag in hexadecimal, so that two runs that met on one
+link by mistake would still not hear each other.
 """
 
 from __future__ import annotations

@@ -1,12 +1,14 @@
-"""The messages on the wire: seven fields in a msgpack list, refused with a named reason when anything is off.
+"""The messages on the wire: seven fields in a msgpack list, refused with a named reason when
+anything is off.
 
-Data flow: plant -> node (measurement), node -> node (running sums), node -> plant (command), every process
+Data flow: plant -> node (measurement), node -> node (running sums), node -> plant (command), every
+process
 -> recorder (telemetry, counters), plant -> all (stop).
 
-A message is `[version, kind, run, tick, sender, setpoint, payload]`: five integers that say what it is and
-where it belongs, the index of the active setpoint (theory, section 5: one set of sweep matrices a setpoint),
-and the payload. The payload of the control kinds is a list of doubles; that of the others is stated at their
-encoder.
+A message is `[version, kind, run, tick, sender, setpoint, payload]`: five integers that say what it
+is and where it belongs, the index of the active setpoint (theory, section 5: one set of sweep
+matrices a setpoint), and the payload. The payload of the control kinds is a list of doubles; that
+of the others is stated at their encoder.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ PLANT = -1
 """The sender number of the plant; nodes send their index 0..n-1."""
 FIELDS = 7
 LONGEST_TEXT = 2000
-"""Characters that a stop message carries at most, so that its status line stays within one pipe write."""
+"""Characters that a stop message carries at most, so that its status line stays within one pipe
+write."""
 LARGEST_TICK = 2**53
 """Ticks beyond this could not be told apart in a recording, whose numbers are doubles."""
 
@@ -65,7 +68,8 @@ class Reason(StrEnum):
 
 
 class RejectedError(Exception):
-    """A message that was refused; `reason` is counted, the text says what was expected and what came."""
+    """A message that was refused; `reason` is counted, the text says what was expected and what
+    came."""
 
     def __init__(self, reason: Reason, text: str) -> None:
         super().__init__(f"{reason.value}: {text}")
@@ -90,7 +94,8 @@ class Batch(NamedTuple):
 
 
 class Stop(NamedTuple):
-    """The end of a run: `cause` is 'finished', 'interrupted' or 'safety', `tick` the first one not done."""
+    """The end of a run: `cause` is 'finished', 'interrupted' or 'safety', `tick` the first one not
+    done."""
 
     tick: int
     cause: str
@@ -116,7 +121,8 @@ def encode_batch(run: int, tick: int, sender: int, rows: npt.NDArray[np.float64]
 
 
 def encode_counters(run: int, tick: int, sender: int, counters: Mapping[str, int]) -> bytes:
-    """Encode the final counters of a process: a list of [name, number]; `tick` is the first one not done."""
+    """Encode the final counters of a process: a list of [name, number]; `tick` is the first one not
+    done."""
     payload = [[name, value] for name, value in counters.items()]
     return _pack([VERSION, int(Kind.COUNTERS), run, tick, sender, 0, payload])
 
@@ -132,7 +138,8 @@ def decode_numbers(
 ) -> Numbers:
     """Decode and check one control message; RejectedError names the first thing that is wrong.
 
-    `lengths` gives for each setpoint how many doubles such a message carries (a sum's rank may differ).
+    `lengths` gives for each setpoint how many doubles such a message carries (a sum's rank may
+    differ).
     """
     tick, came_from, setpoint, values = _header(raw, kind, run)
     if came_from != sender:

@@ -1,7 +1,9 @@
-"""What the launcher tells each process of a run, as JSON: the run itself and one configuration a process.
+"""What the launcher tells each process of a run, as JSON: the run itself and one configuration a
+process.
 
-Made once by the launcher, sent to the children as one line each (or a file, for a node started by hand), and
-written into the recording, so that a run can be understood and recomputed from its recording alone.
+Made once by the launcher, sent to the children as one line each (or a file, for a node started by
+hand), and written into the recording, so that a run can be understood and recomputed from its
+recording alone.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class DisturbanceConfig:
-    """A built-in disturbance of the plant; the unit of the amplitude is its own (plant.disturbance)."""
+    """A built-in disturbance of the plant; the unit of the amplitude is its own
+    (plant.disturbance)."""
 
     name: str = "none"
     amplitude: float = 1.0
@@ -71,9 +74,7 @@ class RunConfig:
         if not (math.isfinite(self.tick_s) and self.tick_s > 0.0):
             raise UsageError(f"tick_s: expected a positive number of seconds, got {self.tick_s!r}")
         if len(self.faces_m) != self.nodes + 1:
-            raise UsageError(
-                f"faces_m: expected {self.nodes + 1} numbers, got {len(self.faces_m)}"
-            )
+            raise UsageError(f"faces_m: expected {self.nodes + 1} numbers, got {len(self.faces_m)}")
         if self.setpoint not in self.setpoint_names:
             raise UsageError(f"setpoint {self.setpoint!r}: not in {self.setpoint_names}")
 
@@ -139,7 +140,8 @@ class PlantConfig:
 
 @dataclass(frozen=True)
 class RecorderConfig:
-    """What the recorder needs: the run, the file, what to attach, and how wide each node's records are."""
+    """What the recorder needs: the run, the file, what to attach, and how wide each node's records
+    are."""
 
     run: RunConfig
     path: str
@@ -174,7 +176,8 @@ def _bytes_in(data: dict[str, Any]) -> Any:
 
 
 def loads(cls: type[T], text: str | bytes, where: str) -> T:
-    """A configuration from JSON; UsageError names the field that is missing, unknown or of a wrong type."""
+    """A configuration from JSON; UsageError names the field that is missing, unknown or of a wrong
+    type."""
     try:
         data = json.loads(text, object_hook=_bytes_in)
     except (ValueError, TypeError, RecursionError) as error:

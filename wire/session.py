@@ -1,9 +1,9 @@
 """How every process opens its one Zenoh session: explicit links, no scouting, one runtime thread.
 
-Between the process loops (node, plant, recorder) and Zenoh. The topology is a chain: a node listens for its
-right neighbour and dials its left one and its segment of the plant. The plant's session is a router inside the
-plant process: it hands the telemetry of the nodes on to the recorder, its client, without Python touching it,
-and never forwards between two nodes.
+Between the process loops (node, plant, recorder) and Zenoh. The topology is a chain: a node listens
+for its right neighbour and dials its left one and its segment of the plant. The plant's session is
+a router inside the plant process: it hands the telemetry of the nodes on to the recorder, its
+client, without Python touching it, and never forwards between two nodes.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import ctypes
 import json
 import os
 from collections.abc import Callable, Sequence
+from importlib import metadata
 from threading import get_ident
 from typing import Any
 
@@ -27,12 +28,13 @@ RUNTIME_PLANT = (
     "(rx:(handover:app),acc:(handover:app),tx:(worker_threads:1),net:(handover:app),"
     "app:(worker_threads:1))"
 )
-"""A sending thread of its own: forwarding waits in the receiving thread for room in a send queue, which
-nobody would empty if both were one."""
+"""A sending thread of its own: forwarding waits in the receiving thread for room in a send queue,
+which nobody would empty if both were one."""
 
 LEASE_MS = 10_000
-"""A process that dies is noticed at once, its sockets close. The lease only bounds a frozen one, and in
-lock-step the tick deadline is shorter; a loaded machine must not lose a link for a late keep-alive."""
+"""A process that dies is noticed at once, its sockets close. The lease only bounds a frozen one,
+and in lock-step the tick deadline is shorter; a loaded machine must not lose a link for a late
+keep-alive."""
 
 
 def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> dict[str, Any]:
@@ -90,9 +92,11 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> dict[st
 
 
 def open_session(mode: str, listen: Sequence[str], connect: Sequence[str]) -> Any:
-    """Open the process's Zenoh session; `mode` is "peer" (node), "router" (plant) or "client" (recorder).
+    """Open the process's Zenoh session; `mode` is "peer" (node), "router" (plant) or "client"
+    (recorder).
 
-    Sets ZENOH_RUNTIME, which the library reads once a process, so it must be the first call into it.
+    Sets ZENOH_RUNTIME, which the library reads once a process, so it must be the first call into
+    it.
     """
     os.environ["ZENOH_RUNTIME"] = RUNTIME_PLANT if mode == "router" else RUNTIME_NODE
     text = json.dumps(_config(mode, listen, connect))
@@ -102,8 +106,8 @@ def open_session(mode: str, listen: Sequence[str], connect: Sequence[str]) -> An
 def direct(function: Callable[[bytes], None]) -> Any:
     """A subscriber's handler that calls `function(payload)` on Zenoh's receiving thread.
 
-    The thread keeps its Python thread state after the first call: creating and destroying it would cost
-    more than the message itself.
+    The thread keeps its Python thread state after the first call: creating and destroying it would
+    cost more than the message itself.
     """
     seen: set[int] = set()
     attach = ctypes.pythonapi.PyGILState_Ensure
@@ -139,7 +143,8 @@ def control_publisher(session: Any, key: str) -> Any:
 
 
 def telemetry_publisher(session: Any, key: str) -> Any:
-    """A publisher for records: after everything else; dropped rather than hold the control path up."""
+    """A publisher for records: after everything else; dropped rather than hold the control path
+    up."""
     return session.declare_publisher(
         key,
         express=False,
@@ -160,4 +165,4 @@ def is_put(sample: Any) -> bool:
 
 def versions() -> dict[str, str]:
     """Version of the Zenoh binding, for metadata and the doctor."""
-    return {"eclipse-zenoh": str(zenoh.__version__)}
+    return {"eclipse-zenoh": metadata.version("eclipse-zenoh")}

@@ -1,0 +1,130 @@
+"""The main job from options to result: plan, directory, processes, summary, plot.
+
+Between the command line, which only knows options and printing, and the conductor, which only knows
+processes.
+"""
+
+from __future__ import annotations
+
+import traceback
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from supervise.conductor import Conductor, Interrupted, Outcome, log_of
+from supervise.endpoints import choose
+from supervise.plan import Plan, RunOptions, make_plan, new_run_id, prepare
+from supervise.view import View, choose_view
+from wire.errors import ExitCode, UsageError
+
+RECORDING = "recording.mcap"
+PLOT = "plot.png"
+
+
+@dataclass
+class Result:
+    """What a run left behind."""
+
+    outcome: Outcome
+    directory: Path
+    recording: Path
+    plot: Path | None = None
+    summary: dict[str, Any] = field(default_factory=dict)
+    """From the recording (analysis.summary) and the launcher's own clock."""
+
+
+def execute(options: RunOptions, *, quiet: bool, plot: bool) -> Result:
+    """Run the arm once. Raises OctarmError if it did not come to the first tick."""
+    prepared = prepare(options)
+    run_id = new_run_id()
+    endpoints = choose(options.nodes, options.transport, options.base_port, options.socket_dir)
+    try:
+        directory, made = _make_directory(options.out, run_id)
+        plan = make_plan(options, prepared, endpoints, run_id, directory)
+        with choose_view(options.ticks, quiet=quiet) as view:
+            try:
+                outcome = _conduct(plan, view)
+            except BaseException:
+                _remove_if_empty(directory, made)
+                raise
+            result = Result(outcome, directory, directory / RECORDING)
+            _conclude(result, view, plot)
+    finally:
+        endpoints.close()
+    return result
+
+
+def _conduct(plan: Plan, view: View) -> Outcome:
+    with Conductor(plan, view) as conductor:
+        try:
+            return conductor.run()
+        except Interrupted:
+            text = "interrupted before the first tick"
+            return Outcome(ExitCode.INTERRUPTED, text, 0, 0.0, 0.0)
+
+
+def _make_directory(out: Path | None, run_id: str) -> tuple[Path, bool]:
+    """The run's own directory, and whether it was made here; nothing is ever written over."""
+    directory = Path("runs") / run_id if out is None else out
+    try:
+        made = not directory.exists()
+        directory.mkdir(parents=True, exist_ok=True)
+        occupied = next(directory.iterdir(), None)
+        probe = directory / ".octarm-probe"
+        if occupied is None:
+            probe.touch()
+            probe.unlink()
+    except OSError as error:
+        raise UsageError(
+            f"--out {directory}: {error.strerror or error}; give a directory that can be written"
+        ) from None
+    if occupied is not None:
+        raise UsageError(
+            f"--out {directory}: there is something in it already ({occupied.name}); nothing is "
+            "written over, give another directory"
+        )
+    return directory.absolute(), made
+
+
+def _remove_if_empty(directory: Path, made: bool) -> None:
+    """Leave no empty directory behind a run that never began; keep what explains why."""
+    for file in directory.iterdir():
+        if file.name == RECORDING or (file == log_of(directory) and file.stat().st_size == 0):
+            file.unlink()
+    if made and not any(directory.iterdir()):
+        directory.rmdir()
+
+
+def _conclude(result: Result, view: View, plot: bool) -> None:
+    """Read the recording back: figures and plot."""
+    outcome = result.outcome
+    if not result.recording.exists():
+        return
+    try:
+        from analysis.summary import summarise
+
+        result.summary = dict(summarise(result.recording))
+        if plot and outcome.ticks > 1:
+            from analysis.plot import plot_run
+
+            target = result.directory / PLOT
+            plot_run(result.recording, target)
+            result.plot = target
+    except Exception as error:
+        if outcome.exit_code is not ExitCode.OK:
+            view.note(f"no summary of the broken-off run: {error}")
+            return
+        with log_of(result.directory).open("a") as log:
+            traceback.print_exc(file=log)
+        outcome.exit_code = ExitCode.INTERNAL
+        outcome.message = (
+            f"the run is recorded, but its summary failed: {error}; see {log_of(result.directory)}"
+        )
+    result.summary |= {
+        "run_s": outcome.run_s,
+        "ticks_per_s": outcome.ticks / outcome.run_s if outcome.run_s > 0.0 else None,
+        "recording": str(result.recording),
+        "plot": None if result.plot is None else str(result.plot),
+        "exit_code": int(outcome.exit_code),
+        "message": outcome.message,
+    }

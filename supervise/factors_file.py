@@ -1,0 +1,74 @@
+"""What `octarm deploy` shows and writes: ranks and message sizes, and every node's matrices as
+JSON.
+
+The file serves targets that run a node in other software: matrices, offsets and starting values of
+the sweep (theory, section 5), in SI units.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+from deploy import Deployment, NodeFactors
+from wire.messages import Kind, encode_numbers, run_tag
+
+
+def readable(factors: NodeFactors) -> dict[str, Any]:
+    """One node's factors as plain lists."""
+    return {
+        "index": factors.index,
+        "initial_estimate": factors.initial_estimate.tolist(),
+        "initial_command_n_per_m": factors.initial_command.tolist(),
+        "setpoints": [
+            {f.name: getattr(one, f.name).tolist() for f in dataclasses.fields(one)}
+            for one in factors.setpoints
+        ],
+    }
+
+
+def factors_json(deployment: Deployment) -> str:
+    """Grid, ranks and every node's factors as one JSON object."""
+    return json.dumps(
+        {
+            "faces_m": deployment.faces_m.tolist(),
+            "tick_s": deployment.tick_s,
+            "setpoint_names": list(deployment.setpoint_names),
+            "ranks_forward": [list(ranks) for ranks in deployment.ranks_forward],
+            "ranks_backward": [list(ranks) for ranks in deployment.ranks_backward],
+            "largest_difference_to_dense": deployment.check,
+            "nodes": [readable(factors) for factors in deployment.nodes],
+        }
+    )
+
+
+def message_bytes(numbers: int, tick: int = 1000, node: int = 50) -> int:
+    """Bytes of an encoded sum with that many numbers, at a typical tick and node."""
+    raw = encode_numbers(Kind.FORWARD_SUM, run_tag("typical"), tick, node, 0, [0.1] * numbers)
+    return len(raw)
+
+
+def facts(deployment: Deployment) -> dict[str, Any]:
+    """The table of `octarm deploy`."""
+    rows = []
+    for i, name in enumerate(deployment.setpoint_names):
+        forward, backward = deployment.ranks_forward[i], deployment.ranks_backward[i]
+        both = (*forward, *backward)
+        rows.append(
+            {
+                "name": name,
+                "rank_forward": max(forward),
+                "rank_backward": max(backward),
+                "bytes_per_message": [message_bytes(min(both)), message_bytes(max(both))],
+                "spectral_radius": deployment.spectral_radius[i].largest,
+            }
+        )
+    return {
+        "nodes": len(deployment.nodes),
+        "tick_s": deployment.tick_s,
+        "faces_m": deployment.faces_m.tolist(),
+        "messages_per_tick": deployment.messages_per_tick,
+        "largest_difference_to_dense": deployment.check,
+        "setpoints": rows,
+    }
