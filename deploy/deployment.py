@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NoReturn
 
@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import legendre
 
+from deploy.arm import ArmModes, make_arm_modes
 from deploy.grid import Place, SegmentGrid, make_grid
 from deploy.semiseparable import NodeMatrices, multiply, realise
 from deploy.stability import SpectralRadius, longest_stable_tick, spectral_radius
@@ -67,19 +68,18 @@ class Deployment:
     check: float
     """Largest relative difference of sweeps and dense matrix, random inputs, over all setpoints."""
     spectral_radius: tuple[SpectralRadius, ...]
-    """Per setpoint, of one tick of the nominal closed loop."""
+    """Per setpoint, of one tick of the closed loop."""
     energy_weights: Array
     """(n, 4): sum(energy_weights * x**2) is the energy in J of a deviation x (n, 4)."""
-    loops: tuple[Loop, ...]
-    """Per setpoint, the continuous-time model and gains on the grid."""
+    _loops: tuple[tuple[Loop, ArmModes], ...] = field(repr=False)
 
     @cached_property
     def longest_stable_tick_s(self) -> float:
-        """Longest tick with stable nominal loops on this grid, to 1 %; inf if any tick is.
+        """Longest tick at which all loops are stable on this grid, to 2 %; inf if all are.
 
         Computed when asked for (some seconds at 100 nodes).
         """
-        return longest_stable_tick(self.loops)
+        return longest_stable_tick(self._loops, self.tick_s, stable=True)
 
     @property
     def messages_per_tick(self) -> int:
@@ -104,10 +104,14 @@ def deploy(
         raise UsageError(f"tick: expected a positive number of seconds, got {tick_s!r}")
     loops = tuple(make_loop(artefact.arm, setpoint, grid) for setpoint in artefact.setpoints)
     steps = [make_step(loop, tick_s) for loop in loops]
-    radii = tuple(spectral_radius(step) for step in steps)
+    modes = [make_arm_modes(artefact.arm, one.curvature_per_m, grid) for one in artefact.setpoints]
+    pairs = tuple(zip(loops, modes, strict=True))
+    radii = tuple(
+        spectral_radius(step, one, tick_s) for step, one in zip(steps, modes, strict=True)
+    )
     for setpoint, radius in zip(artefact.setpoints, radii, strict=True):
         if not radius.stable:
-            _refuse_tick(setpoint, radius, loops, tick_s)
+            _refuse_tick(setpoint, radius, pairs)
     dense: list[DenseStep] = []
     factors: list[list[SweepFactors]] = []
     worst = 0.0
@@ -136,22 +140,27 @@ def deploy(
         check=worst,
         spectral_radius=radii,
         energy_weights=grid.energy_weights(artefact.arm),
-        loops=loops,
+        _loops=pairs,
     )
 
 
 def _refuse_tick(
-    setpoint: Setpoint, radius: SpectralRadius, loops: Sequence[Loop], tick_s: float
+    setpoint: Setpoint, radius: SpectralRadius, loops: Sequence[tuple[Loop, ArmModes]]
 ) -> NoReturn:
-    part = "observer" if radius.observer_error >= radius.controlled_state else "controller"
-    longest = longest_stable_tick(loops, tick_s)
+    parts = {
+        "observer": radius.observer_error,
+        "controller": radius.controlled_state,
+        "arm with observer and controller": radius.arm,
+    }
+    part = max(parts, key=lambda key: parts[key])
+    longest = longest_stable_tick(loops, radius.tick_s, stable=False)
     remedy = (
         f"the longest stable tick on this grid is {longest:.3g} s"
         if longest > 0.0
-        else "no tick makes these gains stable here; use more nodes or design other gains"
+        else "no tick makes these gains stable on this grid: use more nodes or weaker gains"
     )
     raise UsageError(
-        f"tick {tick_s:g} s is too long: at setpoint {setpoint.name!r} the sampled {part} "
+        f"tick {radius.tick_s:g} s is too long: at setpoint {setpoint.name!r} the sampled {part} "
         f"grows by a factor {radius.largest:.6g} a tick (must be below 1); {remedy}"
     )
 

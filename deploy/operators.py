@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from deploy.grid import Place, SegmentGrid
-from wire.artefact import OperatorFactors
+from wire.artefact import OperatorFactors, PolynomialMatrix
 
 Array = npt.NDArray[np.float64]
 
@@ -64,20 +64,31 @@ def operator_matrix(
 
     `outputs` and `inputs` give the place of each component of a node's output and input.
     """
-    n, length = grid.nodes, grid.length_m
+    n = grid.nodes
     matrix = np.zeros((n, len(outputs), n, len(inputs)))
     for a, to in enumerate(outputs):
-        here = grid.locations_m(to)
-        n0 = factors.n0(here, length)
-        n1a, n2a = factors.n1a(here, length)[:, a], factors.n2a(here, length)[:, a]
+        n0 = factors.n0(grid.locations_m(to), grid.length_m)
         for b, source in enumerate(inputs):
-            there = grid.locations_m(source)
-            kernel1 = n1a @ factors.n1b(there, length)[:, :, b].T
-            kernel2 = n2a @ factors.n2b(there, length)[:, :, b].T
             before, after = side_weights(grid, to, source)
+            places = (grid.locations_m(to), a, grid.locations_m(source), b, grid.length_m)
             matrix[:, a, :, b] = (
                 n0[:, a, b, None] * interpolation(grid, to, source)
-                + before * kernel1
-                + after * kernel2
+                + before * _kernel(factors.n1a, factors.n1b, *places)
+                + after * _kernel(factors.n2a, factors.n2b, *places)
             )
     return matrix.reshape(n * len(outputs), n * len(inputs))
+
+
+def _kernel(
+    left: PolynomialMatrix,
+    right: PolynomialMatrix,
+    to_m: Array,
+    row: int,
+    from_m: Array,
+    column: int,
+    length_m: float,
+) -> Array:
+    """left(s) right(t) at all pairs of places, (n, n), for one row of left and column of right."""
+    if not right.coefficients:  # no terms
+        return np.zeros((len(to_m), len(from_m)))
+    return left(to_m, length_m)[:, row] @ right(from_m, length_m)[:, :, column].T

@@ -1,16 +1,21 @@
 """One tick of observer and controller as one matrix: what the sweeps distribute over the nodes.
 
-In deviations from the setpoint, with xh_t = A xh + B u + L (C xh - y) and u = K xh, one tick of
+In deviations from the setpoint, with xh_t = A xh + B u + L (C xh - y) and u = K xh, a tick of
 length h is
-    xf      = xh(k) + X (C xh(k) - y(k)),      X  = h L (I - h C L)^-1       correct with the
-    measurement xh(k+1) = S xf + F u(k),                   S  = (I - h/2 A)^-1 (I + h/2 A),  F = h
-    (I - h/2 A)^-1 B u(k+1)  = Kh xh(k+1),                      Kh = (I - h K B)^-1 K.
-S is the implicit midpoint rule: it keeps the energy of the conservative part exactly at every tick
-length. The correction is the implicit Euler step of xh_t = L (C xh - y) and Kh that of x_t = B K x:
-where the gains only take energy out (the closed-form gains do), I + X C and S both contract, so the
-observer is stable at any tick, and no gain acts as more than 1/h. All of it agrees with the
-continuous gains to first order in h, and the rank of X and Kh off the diagonal is that of L and K,
-so the sweeps carry no more numbers than with the explicit Euler step.
+    xf      = xh(k) + X (C xh(k) - y(k)),   X  = h L (I - h C L)^-1           correct with y
+    xh(k+1) = S xf + F u(k),                S  = (I - p h A)^-1 (I + (1-p) h A)   predict
+                                            F  = h (I - p h A)^-1 B
+    u(k+1)  = Kh xh(k+1),                   Kh = (I - h K B)^-1 K.
+p = 1/2 would be the implicit midpoint rule, which keeps the conservative energy exactly at every
+tick. p is slightly larger (`IMPLICITNESS`), so that modes too fast for the tick (h w >> 1), which
+no rule of one solve turns at the right rate, die out of the estimate (by (1-p)/p a tick) instead of
+ringing on in it.
+
+The correction is the implicit Euler step of xh_t = L (C xh - y) and Kh that of x_t = B K x. Where
+the gains only take energy out, I + X C and S both contract, so the observer is stable at any tick,
+and no gain acts as more than 1/h. All of it agrees with the continuous gains to first order in h.
+Off the diagonal X and Kh have the ranks of L and K and S has that of A, so the sums are as short as
+with the explicit Euler step.
 """
 
 from __future__ import annotations
@@ -33,6 +38,9 @@ from wire.artefact import Arm, Setpoint
 from wire.factors import INPUTS, OUTPUTS
 
 Array = npt.NDArray[np.float64]
+
+IMPLICITNESS = 0.55
+"""The weight p of the new state in the prediction; 1/2 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +78,16 @@ class Step:
     """(7n,): scaled input = scale_in * input, flattened node by node as (xh, u, y)."""
     scale_out: Array
     """(5n,): scaled output = scale_out * output, flattened node by node as (xh, u)."""
+
+    @property
+    def command_scale(self) -> Array:
+        """(n,): scaled command = command_scale * u."""
+        return self.scale_out[OUTPUTS - 1 :: OUTPUTS]
+
+    @property
+    def measurement_scale(self) -> Array:
+        """(2n,): scaled measurement = measurement_scale * y."""
+        return self.scale_in.reshape(-1, INPUTS)[:, OUTPUTS:].ravel()
 
     def whole(self) -> Array:
         """The whole tick, scaled, (5n, 7n): inputs (xh, u, y) and outputs (xh, u) node by node."""
@@ -120,11 +138,12 @@ def make_step(loop: Loop, tick_s: float) -> Step:
     C = y[:, None] * loop.model.C / x
     L = x[:, None] * loop.L / y
     K = u[:, None] * loop.K / x
-    implicit = np.eye(4 * n) - 0.5 * h * A
-    solved = _solve(implicit, np.hstack([2.0 * np.eye(4 * n), h * B]))
+    p = IMPLICITNESS
+    identity = np.eye(4 * n)
+    solved = _solve(identity - p * h * A, np.hstack([identity / p, h * B]))
     scales = np.hstack([x.reshape(n, 4), u[:, None], y.reshape(n, 2)])
     return Step(
-        transition=solved[:, : 4 * n] - np.eye(4 * n),
+        transition=solved[:, : 4 * n] - (1.0 - p) / p * identity,
         force=solved[:, 4 * n :],
         correction=_solve(np.eye(2 * n) - h * (C @ L).T, h * L.T).T,
         measure=C,
