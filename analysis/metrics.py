@@ -73,7 +73,8 @@ def decay_rate(times_s: Array, values: Array) -> float | None:
 def extrapolated_time_below(times_s: Array, values: Array, threshold: float) -> float | None:
     """Where the fitted decay of the second half would cross the threshold, in s.
 
-    An estimate, not a measurement, meant for a record in which `time_below` is None. None as well if the values do not decay.
+    An estimate, not a measurement, meant for a record in which `time_below` is None. None as well
+    if the values do not decay.
     """
     rate = decay_rate(times_s, values)
     if rate is None or rate <= 0.0:
@@ -100,13 +101,15 @@ class ControlEffort:
 def control_effort(commands: Array, faces_m: Array, tick_s: float) -> ControlEffort:
     """Effort of the load that the plant applies: linear between faces, constant on the first cell.
 
-    commands: (K, n) in N/m, each held for one tick; faces_m: (n + 1,).
+    commands: (K, n) in N/m, each held for one tick; ticks with a value that is not finite are left
+    out. faces_m: (n + 1,).
     """
     if commands.ndim != 2 or commands.shape[1] != faces_m.size - 1:
         raise UsageError(
             f"control effort: expected commands of shape (K, {faces_m.size - 1}) for "
             f"{faces_m.size} faces, got {commands.shape}"
         )
+    commands = commands[np.isfinite(commands).all(axis=1)]
     if commands.size == 0:
         return ControlEffort(0.0, 0.0, 0.0)
     at_faces = np.concatenate([commands[:, :1], commands], axis=1)

@@ -1,0 +1,113 @@
+"""The model alone, as the yardstick of the observer: same arm, same commands, no measurement.
+
+The open-loop model starts where the observer starts (xh(0), observer state zero) and is driven by
+the recorded commands with L = 0,
+
+    x(k+1) = S x(k) + F u(k)   in deviations from the setpoint (theory, section 5),
+
+so its error decays by the arm's own damping only; what the observer is better by is the merit of
+the measurements.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from analysis.metrics import (
+    decay_rate,
+    energy_norm,
+    extrapolated_time_below,
+    relative,
+    time_below,
+)
+from analysis.recording import Recording
+from deploy import DenseStep, deploy
+from wire.artefact import GainsArtefact, OperatorFactors, PolynomialMatrix
+
+Array = npt.NDArray[np.float64]
+
+THRESHOLD = 0.01
+"""The share of the initial error whose crossing is reported."""
+
+
+def without_observer(artefact: GainsArtefact, setpoint: int) -> GainsArtefact:
+    """The artefact with one setpoint only and that one's observer gain set to zero."""
+    chosen = artefact.setpoints[setpoint]
+    silent = OperatorFactors(
+        *(
+            PolynomialMatrix.from_array(np.zeros_like(matrix.array))
+            for matrix in msgspec.structs.astuple(chosen.observer)
+        )
+    )
+    return msgspec.structs.replace(
+        artefact, setpoints=[msgspec.structs.replace(chosen, observer=silent)]
+    )
+
+
+def open_loop_run(step: DenseStep, initial_estimates: Array, commands: Array) -> Array:
+    """Estimates of the model without correction at each tick, absolute, SI.
+
+    step: of a deployment without observer; initial_estimates: (n, 4); commands: (K, n) in N/m,
+    command k held over tick k. Returns (K, n, 4).
+    """
+    ticks, nodes = commands.shape
+    out = np.empty((ticks, nodes, 4))
+    inputs = np.zeros((nodes, 7))  # the measurements' columns meet zeros in the matrix
+    inputs[:, :4] = initial_estimates
+    for k in range(ticks):
+        out[k] = inputs[:, :4]
+        inputs[:, 4] = commands[k]
+        inputs[:, :4] = step(inputs)[:, :4]
+    return out
+
+
+@dataclass(frozen=True)
+class ErrorCourse:
+    """Estimation error of one estimator over a run."""
+
+    norm: Array
+    """(K,) energy norm of estimate - truth, J^(1/2)."""
+    relative: Array
+    """(K,) the same divided by its value at tick 0."""
+    below_1_percent_s: float | None
+    """First time from which the relative error stays below 1 % to the end; None if it does not."""
+    below_1_percent_extrapolated_s: float | None
+    """Where `below_1_percent_s` is None: when the fitted decay would get there, an estimate."""
+    decay_per_s: float | None
+    """Fitted exponential rate over the second half of the run."""
+
+
+def error_course(times_s: Array, truth: Array, estimates: Array, weights: Array) -> ErrorCourse:
+    """Estimation error over time; truth and estimates: (K, n, 4), energy weights: (n, 4)."""
+    norm = energy_norm(estimates - truth, weights)
+    share = relative(norm)
+    reached = time_below(times_s, share, THRESHOLD)
+    return ErrorCourse(
+        norm=norm,
+        relative=share,
+        below_1_percent_s=reached,
+        below_1_percent_extrapolated_s=(
+            extrapolated_time_below(times_s, share, THRESHOLD) if reached is None else None
+        ),
+        decay_per_s=decay_rate(times_s, share),
+    )
+
+
+def compare_with_open_loop(recording: Recording) -> tuple[ErrorCourse, ErrorCourse]:
+    """Error over time of the recorded observer and of the open-loop model, in this order."""
+    run = recording.configuration
+    silent = without_observer(recording.artefact, run.setpoint_index)
+    model = open_loop_run(
+        deploy(silent, run.nodes, run.tick_s, run.faces_m).dense[0],
+        recording.initial_estimates,
+        recording.commands,
+    )
+    observer, open_loop = (
+        error_course(recording.times_s, recording.truth, estimates, recording.energy_weights)
+        for estimates in (recording.estimates, model)
+    )
+    return observer, open_loop

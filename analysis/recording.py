@@ -1,0 +1,266 @@
+"""A recording as arrays: what the recorder wrote during a run, typed and checked.
+
+Everything that the figures of a run need is in the file itself: the configuration, the gains
+artefact (attached), the counters, and one channel per kind of message and node (docs/recording.md).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from analysis.mcap_file import McapContent, read_mcap
+from analysis.table import Table, decode_table
+from deploy import Deployment, deploy
+from wire.artefact import FORMAT as GAINS_FORMAT
+from wire.artefact import GainsArtefact, read_artefact
+from wire.channels import (
+    COMMAND,
+    FORMAT_VERSION,
+    MEASUREMENT,
+    METADATA,
+    SHAPE_POINTS,
+    STATE,
+    SUMMARY,
+    label,
+)
+from wire.errors import GainsRefusedError, UsageError
+from wire.run_config import RunConfig, loads
+
+Array = npt.NDArray[np.float64]
+
+QUANTITIES = (*STATE, *COMMAND)
+"""What a node computes each tick, in the order of the dense step's output."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One run. Its arrays have K = `ticks` rows; NaN marks what the recorder did not get."""
+
+    path: Path
+    unfinished: str | None
+    """None if the file was closed properly, else where and how it stops."""
+    configuration: RunConfig
+    artefact: GainsArtefact
+    facts: Mapping[str, str]
+    """The metadata written at the start: versions, digest, configuration."""
+    counters: Mapping[str, str] | None
+    """The metadata written at the end; None if the recorder did not get there."""
+    tables: Mapping[str, Table]
+    """Per topic."""
+    ticks: int
+    """K: ticks 0 .. K - 1 were reached by every node and the plant."""
+
+    def table(self, topic: str) -> Table:
+        """The messages of a topic; UsageError if there is no such channel."""
+        try:
+            return self.tables[topic]
+        except KeyError:
+            raise UsageError(f"recording {self.path}: there is no channel {topic} in it") from None
+
+    def of_nodes(self, channel: str, fields: Sequence[str]) -> Array:
+        """Fields of /node/NN/<channel> at all nodes, shape (K, n, fields)."""
+        return self._stack([f"/node/{self._label(i)}/{channel}" for i in self._indices], fields)
+
+    def of_plant(self, channel: str, fields: Sequence[str]) -> Array:
+        """Fields of /plant/<channel>, shape (K, fields)."""
+        return self.table(f"/plant/{channel}").by_tick(fields, self.ticks)
+
+    @property
+    def nodes(self) -> int:
+        """The number of nodes n."""
+        return self.configuration.nodes
+
+    @property
+    def tick_s(self) -> float:
+        """The period of a tick."""
+        return self.configuration.tick_s
+
+    @cached_property
+    def times_s(self) -> Array:
+        """Time of each tick, (K,)."""
+        return np.arange(self.ticks, dtype=np.float64) * self.tick_s
+
+    @cached_property
+    def measurements(self) -> Array:
+        """y_i(k): v_y and curvature, (K, n, 2)."""
+        return self.of_nodes("measurement", MEASUREMENT)
+
+    @cached_property
+    def estimates(self) -> Array:
+        """xh_i(k): v_x, v_y, axial strain, curvature, (K, n, 4), absolute."""
+        return self.of_nodes("estimate", STATE)
+
+    @cached_property
+    def commands(self) -> Array:
+        """u_i(k): transverse load in N/m, (K, n)."""
+        return self.of_nodes("command", COMMAND)[:, :, 0]
+
+    @cached_property
+    def truth(self) -> Array:
+        """The plant's exact state where the nodes hold theirs, (K, n, 4)."""
+        return self._stack([f"/plant/truth/{self._label(i)}" for i in self._indices], STATE)
+
+    @cached_property
+    def tip_error_m(self) -> Array:
+        """Distance of the tip from the setpoint's, (K,)."""
+        return self.of_plant("tip", ("error_m",))[:, 0]
+
+    @cached_property
+    def shapes_m(self) -> Array:
+        """Points along the arm from root to tip, (K, points, 2)."""
+        fields = [f"{axis}{i:02d}_m" for i in range(SHAPE_POINTS) for axis in "xy"]
+        return self.of_plant("shape", fields).reshape(self.ticks, SHAPE_POINTS, 2)
+
+    @cached_property
+    def sweep_durations_ms(self) -> Array:
+        """From the first measurement sent to the last command received, wall clock, (K,)."""
+        table = self.table("/sweep/timing")
+        return table.by_tick(("duration_wall_ns",), self.ticks)[:, 0] * 1e-6
+
+    @cached_property
+    def initial_estimates(self) -> Array:
+        """xh(0) of the configuration, (n, 4)."""
+        return np.asarray(self.configuration.initial_estimates, dtype=np.float64)
+
+    @cached_property
+    def initial_commands(self) -> Array:
+        """u(0) of the configuration, N/m, (n,)."""
+        return np.asarray(self.configuration.initial_commands_n_per_m, dtype=np.float64)
+
+    @cached_property
+    def energy_weights(self) -> Array:
+        """(n, 4): sum(weights * x**2) is the energy in J of a deviation x."""
+        return np.asarray(self.configuration.energy_weights, dtype=np.float64)
+
+    @cached_property
+    def deployment(self) -> Deployment:
+        """The sweep factors and dense steps, computed anew from artefact and configuration."""
+        run = self.configuration
+        return deploy(self.artefact, run.nodes, run.tick_s, run.faces_m)
+
+    def counter(self, name: str) -> int | None:
+        """A total of the final counters (docs/recording.md); None if the recorder wrote none."""
+        text = (self.counters or {}).get(name)
+        if text is None:
+            return None
+        try:
+            return int(text)
+        except ValueError:
+            raise UsageError(
+                f"recording {self.path}: counter {name} is {text[:40]!r}, not a number"
+            ) from None
+
+    def process_counters(self, process: str) -> dict[str, int]:
+        """The final counters of "plant", "recorder" or "node/NN"; empty if it sent none."""
+        text = (self.counters or {}).get(process)
+        if text is None:
+            return {}
+        try:
+            return msgspec.json.decode(text, type=dict[str, int])
+        except msgspec.DecodeError as error:
+            raise UsageError(f"recording {self.path}: counters of {process}: {error}") from None
+
+    def total(self, name: str) -> int | None:
+        """A counter summed over all nodes; None unless every node has sent its counters."""
+        counts = [self.process_counters(f"node/{self._label(i)}") for i in self._indices]
+        if not all(counts):
+            return None
+        return sum(one.get(name, 0) for one in counts)
+
+    @property
+    def _indices(self) -> range:
+        return range(self.nodes)
+
+    def _label(self, node: int) -> str:
+        return label(node, self.nodes)
+
+    def _stack(self, topics: Sequence[str], fields: Sequence[str]) -> Array:
+        return np.stack([self.table(t).by_tick(fields, self.ticks) for t in topics], axis=1)
+
+
+def read_recording(path: Path) -> Recording:
+    """Read the recording of a run, also one that was cut short.
+
+    Raises UsageError if the file is not an MCAP file, has no octarm metadata or artefact in it (too
+    short or of another program), or a newer format; GainsRefusedError if the attached artefact is
+    damaged.
+    """
+    content = read_mcap(path)
+    facts = content.metadata.get(METADATA)
+    if facts is None:
+        raise UsageError(f"recording {path}: {_not_ours(content)}")
+    version = facts.get("format_version", "")
+    if version != str(FORMAT_VERSION):
+        raise UsageError(
+            f"recording {path}: expected format version {FORMAT_VERSION}, got {version or 'none'}; "
+            "read it with the octarm that wrote it, or a newer one"
+        )
+    if "run" not in facts:
+        raise UsageError(f"recording {path}: no run configuration in its metadata; it was edited")
+    configuration = loads(RunConfig, facts["run"], f"recording {path}: run configuration")
+    try:
+        tables = {topic: decode_table(topic, rows) for topic, rows in content.payloads.items()}
+    except UsageError as error:
+        raise UsageError(f"recording {path}: {error}") from None
+    return Recording(
+        path=path,
+        unfinished=content.unfinished,
+        configuration=configuration,
+        artefact=_artefact(content, path),
+        facts=facts,
+        counters=content.metadata.get(SUMMARY),
+        tables=tables,
+        ticks=_common_ticks(tables, configuration),
+    )
+
+
+def _not_ours(content: McapContent) -> str:
+    if content.unfinished is not None:
+        return f"it {content.unfinished}, before anything of octarm; the run did not begin"
+    topics = ", ".join(sorted(content.payloads)[:5]) or "none"
+    return (
+        f"an MCAP file without {METADATA!r} metadata, so not of octarm (its topics: {topics}); "
+        "give the .mcap file that a run left behind"
+    )
+
+
+def _artefact(content: McapContent, path: Path) -> GainsArtefact:
+    """The attached gains artefact, checked as any artefact file is."""
+    for name, data in content.attachments.items():
+        if f'"{GAINS_FORMAT}"'.encode() not in data[:200]:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            copy = Path(folder) / "attached"
+            copy.write_bytes(data)
+            try:
+                return read_artefact(copy)
+            except GainsRefusedError as error:
+                text = str(error).replace(str(copy), f"{name} attached to recording {path}")
+                raise GainsRefusedError(text) from None
+    attached = ", ".join(content.attachments) or "nothing"
+    raise UsageError(
+        f"recording {path}: expected the gains artefact attached, found {attached}; "
+        "it was cut short before the run began, or edited"
+    )
+
+
+def _common_ticks(tables: Mapping[str, Table], run: RunConfig) -> int:
+    """Ticks from 0 on that the plant and every node have reached in this file."""
+    needed = []
+    for i in range(run.nodes):
+        name = label(i, run.nodes)
+        needed += [f"/node/{name}/{kind}" for kind in ("measurement", "estimate", "command")]
+        needed.append(f"/plant/truth/{name}")
+    last = []
+    for topic in needed:
+        table = tables.get(topic)
+        last.append(-1 if table is None or not table.rows else int(table.ticks.max()))
+    return min(last) + 1

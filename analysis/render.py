@@ -1,0 +1,145 @@
+"""The summary of a run as a table for a person: figure, value with unit, what it means.
+
+Takes the dictionary of `analysis.summary`, gives text; nothing is computed here but units.
+"""
+
+from __future__ import annotations
+
+from io import StringIO
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+WIDTH = 118
+
+
+def render(summary: dict[str, Any], width: int = WIDTH) -> str:
+    """The summary of `analysis.summary.summarise` as text of the given width, without colours."""
+    table = Table(box=box.SIMPLE, pad_edge=False, show_edge=False, padding=(0, 2, 0, 0))
+    table.add_column("figure", no_wrap=True)
+    table.add_column("value", overflow="fold")
+    table.add_column("meaning", overflow="fold")
+    for row in rows(summary):
+        table.add_row(*row)
+    out = StringIO()
+    console = Console(file=out, width=width, color_system=None, markup=False, highlight=False)
+    console.print(table)
+    lines = [line.rstrip() for line in out.getvalue().splitlines()]
+    state = "complete" if summary["recording_complete"] else f"not complete: {_stops(summary)}"
+    return "\n".join([*lines, "", f"recording {summary['recording']} ({state})", ""])
+
+
+def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """The rows of the table: (figure, value, meaning)."""
+    seconds = s["ticks"] * s["tick_s"]
+    short = "" if s["ticks"] == s["ticks_asked_for"] else f" of {s['ticks_asked_for']}"
+    sweep, reached, later = (
+        s["sweep_ms"],
+        s["estimation_below_1_percent_s"],
+        s["estimation_below_1_percent_extrapolated_s"],
+    )
+    out = [
+        (
+            "run",
+            f"{s['nodes']} nodes, {s['ticks']}{short} ticks of {s['tick_s']:g} s",
+            f"{seconds:g} s of the arm's time; setpoint {s['setpoint']}, seed {s['seed']}",
+        ),
+        (
+            "neighbour messages",
+            _traffic(s),
+            f"counted by the receivers; 2 (n - 1) = {s['neighbour_messages_expected_per_tick']} "
+            "are expected",
+        ),
+        ("message size", _number(s["bytes_per_message"], "B", 4), "mean, on the wire"),
+        (
+            "sweep",
+            f"p50 {_number(sweep['p50'], 'ms')}, p99 {_number(sweep['p99'], 'ms')}",
+            "wall clock, first measurement sent to last command back",
+        ),
+        (
+            "difference to central",
+            _number(s["max_difference_to_central"], "", 2),
+            f"relative; the same gains centrally; worst at {_where(s)}",
+        ),
+        (
+            "estimation error",
+            _course(s["estimation_error"], "%", 100.0),
+            f"energy norm; open-loop model {_course(s['open_loop_model_error'], '%', 100.0)}",
+        ),
+        (
+            "  below 1 % after",
+            _time(reached["observer"]),
+            f"open-loop model {_time(reached['open_loop_model'], later['open_loop_model'])}",
+        ),
+        (
+            "tip error",
+            _course(s["tip_error_m"], "mm", 1e3),
+            f"distance from the setpoint's; under 5 % of the first: {_time(s['tip_settling_s'])}",
+        ),
+        (
+            "command",
+            f"rms {_number(s['command_n_per_m']['rms'], 'mN/m', scale=1e3)}, "
+            f"peak {_number(s['command_n_per_m']['peak'], 'mN/m', scale=1e3)}",
+            "transverse load per length over arm and time",
+        ),
+    ]
+    out += [
+        (
+            f"gamma, {role}",
+            f"{_number(g['achieved'], '', 4)} achieved, {_number(g['certified'], '', 4)} certified",
+            "H-infinity norm of the design, and its proven bound",
+        )
+        for role, g in s["gamma"].items()
+    ]
+    out += [
+        (
+            "rejected messages",
+            _count(s["rejected_messages"]),
+            f"malformed, stale or foreign; ticks lost by the recorder: {_count(s['ticks_lost'])}",
+        ),
+        ("start-up", _number(s["start_up_s"], "s", 2), "wall clock, plan to first measurement"),
+        ("gains", s["artefact_sha256"][:16], "SHA-256 of the artefact, first 16 digits"),
+    ]
+    return out
+
+
+def _traffic(s: dict[str, Any]) -> str:
+    if s["neighbour_messages"] is None:
+        return "unknown"
+    return f"{s['neighbour_messages']}, {_count(s['neighbour_messages_per_tick'])} a tick"
+
+
+def _stops(s: dict[str, Any]) -> str:
+    return s["recording_stops"] or "it has no final counters"
+
+
+def _where(s: dict[str, Any]) -> str:
+    d = s["difference_to_central"]
+    return f"tick {d['tick']}, node {d['node']}"
+
+
+def _count(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _number(value: float | None, unit: str, digits: int = 3, scale: float = 1.0) -> str:
+    if value is None:
+        return "unknown"
+    return f"{value * scale:.{digits}g} {unit}".rstrip()
+
+
+def _course(ends: dict[str, float | None], unit: str, scale: float) -> str:
+    first, last = ends["initial"], ends["final"]
+    if first is None or last is None:
+        return "unknown"
+    return f"{first * scale:.3g} -> {last * scale:.3g} {unit}"
+
+
+def _time(value: float | None, extrapolated: float | None = None) -> str:
+    if value is not None:
+        return f"{value:.3g} s"
+    if extrapolated is not None:
+        return f"not within the run (extrapolated: {extrapolated:.3g} s)"
+    return "not within the run"

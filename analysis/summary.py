@@ -1,0 +1,179 @@
+"""The figures of a run in one dictionary, as `octarm run --json` prints it.
+
+Last step of the analysis: everything is taken from the recording alone. The keys are stable; a
+figure that the recording does not hold (a run cut short has no counters) is null.
+`analysis.render` makes a table of it.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from analysis.central import CentralComparison, compare_with_central
+from analysis.metrics import control_effort, time_below
+from analysis.open_loop import compare_with_open_loop
+from analysis.recording import Recording, read_recording
+from analysis.render import render
+from wire.artefact import Certificate
+from wire.errors import UsageError
+
+__all__ = ["render", "summarise", "summary_of"]
+
+SETTLED = 0.05
+"""The tip has settled when its error stays below this share of its initial error."""
+
+
+def summarise(path: Path) -> dict[str, Any]:
+    """The figures of the run in a recording; times in s of the simulated arm unless named wall.
+
+    Raises UsageError or GainsRefusedError as `read_recording` does, and UsageError if not one tick
+    is complete.
+    """
+    return summary_of(read_recording(path))
+
+
+def summary_of(recording: Recording) -> dict[str, Any]:
+    """The figures of a recording that is in memory."""
+    if recording.ticks == 0:
+        stops = recording.unfinished or "was closed properly"
+        raise UsageError(
+            f"recording {recording.path}: no tick that all nodes and the plant have recorded (it "
+            f"{stops}); run again"
+        )
+    run = recording.configuration
+    central = compare_with_central(recording)
+    observer, model = compare_with_open_loop(recording)
+    durations = recording.sweep_durations_ms[np.isfinite(recording.sweep_durations_ms)]
+    tip = recording.tip_error_m
+    effort = control_effort(recording.commands, np.asarray(run.faces_m), run.tick_s)
+    setpoint = recording.artefact.setpoints[run.setpoint_index]
+    mean_rates = recording.of_plant(
+        "regulated", ("mean_velocity_y_m_per_s", "mean_curvature_per_m")
+    )
+    summary = {
+        "run_id": run.run_id,
+        "nodes": run.nodes,
+        "ticks": recording.ticks,
+        "ticks_asked_for": run.ticks,
+        "tick_s": run.tick_s,
+        "setpoint": run.setpoint,
+        "seed": run.seed,
+        **_traffic(recording),
+        "sweep_ms": _percentiles(durations),
+        "start_up_s": _start_up(recording),
+        "max_difference_to_central": central.worst.relative,
+        "difference_to_central": _central(central),
+        "estimation_error": _ends(observer.relative),
+        "estimation_error_root_joule": _ends(observer.norm),
+        "open_loop_model_error": _ends(model.relative),
+        "estimation_below_1_percent_s": {
+            "observer": observer.below_1_percent_s,
+            "open_loop_model": model.below_1_percent_s,
+        },
+        "estimation_below_1_percent_extrapolated_s": {
+            "open_loop_model": model.below_1_percent_extrapolated_s,
+        },
+        "estimation_decay_per_s": {
+            "observer": observer.decay_per_s,
+            "open_loop_model": model.decay_per_s,
+        },
+        "tip_error_m": _ends(tip),
+        "tip_settling_s": time_below(recording.times_s, tip, SETTLED * float(tip[0])),
+        "regulated_rms": {
+            "mean_velocity_y_m_per_s": _rms(mean_rates[:, 0]),
+            "mean_curvature_per_m": _rms(mean_rates[:, 1]),
+        },
+        "command_n_per_m": {"rms": effort.rms_n_per_m, "peak": effort.peak_n_per_m},
+        "control_effort_n2_s_per_m": effort.integral_n2_s_per_m,
+        "gamma": {
+            "observer": _gamma(setpoint.observer_certificate),
+            "controller": _gamma(setpoint.controller_certificate),
+        },
+        "artefact_sha256": run.artefact_sha256,
+        "recording": str(recording.path),
+        "recording_complete": recording.unfinished is None and recording.counters is not None,
+        "recording_stops": recording.unfinished,
+    }
+    return {key: _finite(value) for key, value in summary.items()}
+
+
+def _finite(value: Any) -> Any:
+    """The same with null for what is not finite: JSON has no other word for it."""
+    if isinstance(value, dict):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _traffic(recording: Recording) -> dict[str, Any]:
+    """Message counts of the final counters; null without them."""
+    nodes = recording.nodes
+    neighbours = recording.counter("neighbour_messages")
+    size = recording.counter("neighbour_bytes")
+    done = recording.counter("ticks_recorded")
+    return {
+        "neighbour_messages": neighbours,
+        "neighbour_messages_sent": recording.counter("neighbour_messages_sent"),
+        "neighbour_messages_per_tick": _ratio(neighbours, done),
+        "neighbour_messages_expected_per_tick": 2 * (nodes - 1),
+        "bytes_per_message": _ratio(size, neighbours),
+        "sweep_messages": {
+            "forward": recording.total("forward_received_messages"),
+            "backward": recording.total("backward_received_messages"),
+            "measurement": recording.counter("measurement_messages"),
+            "command": recording.counter("command_messages"),
+        },
+        "rejected_messages": recording.counter("rejected_messages"),
+        "ticks_lost": recording.counter("ticks_lost"),
+    }
+
+
+def _ratio(count: int | None, by: int | None) -> float | int | None:
+    """A quotient, as a whole number where it is one."""
+    if count is None or not by:
+        return None
+    return count // by if count % by == 0 else count / by
+
+
+def _percentiles(durations: Any) -> dict[str, float | None]:
+    if durations.size == 0:
+        return {"p50": None, "p99": None}
+    p50, p99 = np.percentile(durations, [50.0, 99.0])
+    return {"p50": float(p50), "p99": float(p99)}
+
+
+def _start_up(recording: Recording) -> float:
+    """From the plan of the run to the first measurement sent, wall clock, s."""
+    first = recording.table("/sweep/timing").by_tick(("started_wall_ns",), 1)[0, 0]
+    return float(first) * 1e-9
+
+
+def _central(central: CentralComparison) -> dict[str, Any]:
+    worst = central.worst
+    first = central.first_above_tolerance
+    return {
+        "tick": worst.tick,
+        "node": worst.node,
+        "quantity": worst.quantity,
+        "ticks_compared": central.ticks,
+        "values_missing": central.missing,
+        "by_quantity": central.per_quantity,
+        "first_above_1e-12": first and {"tick": first.tick, "node": first.node},
+    }
+
+
+def _ends(values: Any) -> dict[str, float | None]:
+    return {"initial": float(values[0]), "final": float(values[-1])}
+
+
+def _rms(values: Any) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def _gamma(certificate: Certificate) -> dict[str, float]:
+    return {"certified": certificate.certified_gamma, "achieved": certificate.achieved_gamma}

@@ -1,0 +1,155 @@
+"""What a run reports: every key with a plausible value, a table for a person, a picture."""
+
+import json
+import math
+import re
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+from simulated_run import BYTES_PER_MESSAGE, Scenario, make_artefact, write_recording
+
+from analysis.plot import draw_run, plot_run, setpoint_shape, telling_ticks
+from analysis.recording import read_recording
+from analysis.render import render
+from analysis.summary import summarise
+from wire.errors import UsageError
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("run") / "recording.mcap"
+    write_recording(out, Scenario(nodes=4, ticks=240, disturbance="chapter"))
+    return out
+
+
+def test_the_summary_has_what_the_command_line_promises(path: Path) -> None:
+    summary = summarise(path)
+    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+    assert summary["nodes"] == 4
+    assert summary["ticks"] == summary["ticks_asked_for"] == 240
+    assert summary["tick_s"] == 0.1
+    assert summary["neighbour_messages"] == 2 * 3 * 240
+    assert summary["neighbour_messages_per_tick"] == 6
+    assert summary["bytes_per_message"] == BYTES_PER_MESSAGE
+    assert summary["sweep_messages"] == {
+        "forward": 720,
+        "backward": 720,
+        "measurement": 960,
+        "command": 960,
+    }
+    assert 0.0 < summary["sweep_ms"]["p50"] < summary["sweep_ms"]["p99"]
+    assert summary["start_up_s"] == pytest.approx(0.31)
+    assert summary["max_difference_to_central"] < 1e-12
+    assert summary["estimation_error"]["initial"] == 1.0
+    assert 0.0 < summary["estimation_error"]["final"] < 0.5
+    assert summary["tip_error_m"]["initial"] > 0.1
+    assert summary["estimation_below_1_percent_s"] == {"observer": None, "open_loop_model": None}
+    assert summary["gamma"]["observer"] == {"certified": 0.1414, "achieved": 0.135}
+    assert summary["rejected_messages"] == 0
+    assert summary["recording"] == str(path)
+    assert summary["recording_complete"] is True
+    assert len(summary["artefact_sha256"]) == 64
+
+
+def test_the_estimation_error_is_the_energy_of_the_difference(path: Path) -> None:
+    """By hand from the recorded numbers and the arm's stiffnesses, 4 equal segments."""
+    recording = read_recording(path)
+    arm, h = recording.artefact.arm, 0.25
+    dual = np.array([h, h, h, h / 2.0])
+    energy = 0.0
+    for i in range(4):
+        v_x, v_y, e, k = recording.estimates[-1, i] - recording.truth[-1, i]
+        energy += 0.5 * arm.mass_per_length_kg_per_m * dual[i] * (v_x**2 + v_y**2)
+        energy += 0.5 * arm.axial_stiffness_n * h * e**2
+        energy += 0.5 * arm.bending_stiffness_n_m2 * dual[3 - i] * k**2
+    final = summarise(path)["estimation_error_root_joule"]["final"]
+    assert final == pytest.approx(math.sqrt(energy), rel=1e-9)
+
+
+def test_the_table_says_it_in_words_and_units(path: Path) -> None:
+    text = render(summarise(path))
+    assert "4 nodes, 240 ticks of 0.1 s" in text
+    assert "1440, 6 a tick" in text
+    assert "not within the run (extrapolated:" in text
+    assert f"recording {path} (complete)" in text
+    assert "None" not in text
+    assert max(map(len, text.splitlines()[:-1])) <= max(118, len(str(path)) + 25)
+
+
+def test_the_table_of_a_run_cut_short_says_so(path: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    raw = path.read_bytes()
+    cut.write_bytes(raw[: len(raw) // 2])
+    text = render(summarise(cut))
+    assert "of 240 ticks of 0.1 s" in text
+    assert re.search(r"^neighbour messages +unknown ", text, re.MULTILINE)
+    assert "(not complete: ends in the middle of a record at byte" in text
+
+
+def test_the_plot_is_a_png_of_readme_width(path: Path, tmp_path: Path) -> None:
+    png = tmp_path / "new" / "plot.png"
+    plot_run(path, png)  # any warning is an error
+    height, width, _ = matplotlib.image.imread(png).shape
+    assert (width, height) == (1400, 820)
+    assert 50_000 < png.stat().st_size < 1_000_000
+
+
+def test_every_panel_has_labels_with_units_and_nothing_leaves_the_figure(path: Path) -> None:
+    figure = draw_run(read_recording(path))
+    panels = [ax for ax in figure.axes if ax.get_title(loc="left")]
+    assert [ax.get_title(loc="left")[:3] for ax in panels] == [f"({c})" for c in "abcdef"]
+    for ax in panels:
+        assert "[" in ax.get_xlabel()
+        assert ax.get_ylabel()
+        box = ax.get_tightbbox()
+        assert box is not None
+        assert box.x0 >= 0.0
+        assert box.y0 >= 0.0
+        assert box.x1 <= 1400.0
+        assert box.y1 <= 820.0
+
+
+def test_a_recording_cut_short_can_be_plotted(path: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    raw = path.read_bytes()
+    cut.write_bytes(raw[: len(raw) // 2])
+    title = draw_run(read_recording(cut)).get_suptitle()
+    assert "recording unfinished" in title
+
+
+def test_two_nodes_and_two_ticks_can_be_plotted(tmp_path: Path) -> None:
+    small = tmp_path / "small.mcap"
+    write_recording(small, Scenario(nodes=2, ticks=2, setpoint="straight", initial="setpoint"))
+    draw_run(read_recording(small))
+    summary = summarise(small)
+    json.dumps(summary, allow_nan=False)
+    render(summary)
+
+
+def test_one_tick_cannot_be_plotted_and_a_bad_place_is_named(path: Path, tmp_path: Path) -> None:
+    small = tmp_path / "small.mcap"
+    write_recording(small, Scenario(nodes=2, ticks=1))
+    with pytest.raises(UsageError, match="at least 2 complete ticks to plot, got 1"):
+        plot_run(small, tmp_path / "plot.png")
+    assert summarise(small)["ticks"] == 1
+    with pytest.raises(UsageError, match=r"Not a directory|File exists"):
+        plot_run(path, path / "plot.png")
+
+
+def test_the_setpoint_of_constant_curvature_is_an_arc() -> None:
+    bent = make_artefact().setpoints[1]
+    arc = type(bent)(
+        **{f: getattr(bent, f) for f in bent.__struct_fields__} | {"curvature_per_m": [2.0]}
+    )
+    shape = setpoint_shape(arc, 1.0)
+    assert shape[-1] == pytest.approx([math.sin(2.0) / 2.0, (1 - math.cos(2.0)) / 2.0], abs=1e-5)
+
+
+def test_shapes_are_drawn_at_equal_steps_of_the_tips_path() -> None:
+    x = np.concatenate([np.linspace(0.0, 1.0, 11), np.ones(90)])
+    shapes = np.zeros((101, 2, 2))
+    shapes[:, -1, 0] = x
+    assert telling_ticks(shapes, 6) == [0, 2, 4, 6, 8, 10, 100]
+    assert telling_ticks(np.zeros((5, 3, 2)), 6) == [0, 4]
