@@ -67,6 +67,21 @@ def test_products_are_those_of_the_matrices(
         assert sweep.command == out[4]
 
 
+def test_products_use_their_own_arguments_only() -> None:
+    """Nothing that an earlier call left in the buffers gets into a later one."""
+    node = random_node(12, [(2, 2, 3, 3)])
+    f = node.setpoints[0]
+    sweep = NodeSweep(node)
+    x = sweep.input([0.3, -0.2]).copy()
+    sweep.forward(2.0 * x, [5.0, 6.0])
+    sweep.backward(3.0 * x, [7.0, 8.0, 9.0])
+    c, d = np.array([0.1, 0.2]), np.array([0.3, 0.4, 0.5])
+    z = x - f.in_offset
+    expected = f.D @ z + f.P @ c + f.U @ d + f.out_offset
+    np.testing.assert_allclose(sweep.output(x, c, d), expected, rtol=1e-13, atol=1e-13)
+    np.testing.assert_array_equal(sweep.estimate, node.initial_estimate[0])
+
+
 def test_starts_at_the_setpoint_it_is_told() -> None:
     node = random_node(7, [(1, 1, 1, 1), (2, 3, 4, 5)])
     sweep = NodeSweep(node, setpoint=1)
