@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -25,42 +24,32 @@ from analysis.metrics import (
     time_below,
 )
 from analysis.recording import Recording
-from deploy import DenseStep, deploy
-from wire.artefact import GainsArtefact, OperatorFactors, PolynomialMatrix
+from deploy import DenseStep
+from wire.channels import MEASUREMENT, STATE
 
 Array = npt.NDArray[np.float64]
 
+MEASURED = [STATE.index(field) for field in MEASUREMENT]
+"""Columns of the state that are measured, at the same places: v_y and k."""
 THRESHOLD = 0.01
 """The share of the initial error whose crossing is reported."""
-
-
-def without_observer(artefact: GainsArtefact, setpoint: int) -> GainsArtefact:
-    """The artefact with one setpoint only and that one's observer gain set to zero."""
-    chosen = artefact.setpoints[setpoint]
-    silent = OperatorFactors(
-        *(
-            PolynomialMatrix.from_array(np.zeros_like(matrix.array))
-            for matrix in msgspec.structs.astuple(chosen.observer)
-        )
-    )
-    return msgspec.structs.replace(
-        artefact, setpoints=[msgspec.structs.replace(chosen, observer=silent)]
-    )
 
 
 def open_loop_run(step: DenseStep, initial_estimates: Array, commands: Array) -> Array:
     """Estimates of the model without correction at each tick, absolute, SI.
 
-    step: of a deployment without observer; initial_estimates: (n, 4); commands: (K, n) in N/m,
-    command k held over tick k. Returns (K, n, 4).
+    The observer's own step with its own estimate in the measurement's place: the innovation
+    C xh - y is zero, which is the same as L = 0. initial_estimates: (n, 4); commands: (K, n) in
+    N/m, command k held over tick k. Returns (K, n, 4).
     """
     ticks, nodes = commands.shape
     out = np.empty((ticks, nodes, 4))
-    inputs = np.zeros((nodes, 7))  # the measurements' columns meet zeros in the matrix
+    inputs = np.empty((nodes, 7))
     inputs[:, :4] = initial_estimates
     for k in range(ticks):
         out[k] = inputs[:, :4]
         inputs[:, 4] = commands[k]
+        inputs[:, 5:] = inputs[:, MEASURED]
         inputs[:, :4] = step(inputs)[:, :4]
     return out
 
@@ -99,10 +88,8 @@ def error_course(times_s: Array, truth: Array, estimates: Array, weights: Array)
 
 def compare_with_open_loop(recording: Recording) -> tuple[ErrorCourse, ErrorCourse]:
     """Error over time of the recorded observer and of the open-loop model, in this order."""
-    run = recording.configuration
-    silent = without_observer(recording.artefact, run.setpoint_index)
     model = open_loop_run(
-        deploy(silent, run.nodes, run.tick_s, run.faces_m).dense[0],
+        recording.deployment.dense[recording.configuration.setpoint_index],
         recording.initial_estimates,
         recording.commands,
     )

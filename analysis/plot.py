@@ -47,7 +47,11 @@ def plot_run(recording_path: Path, png_path: Path) -> None:
     Raises UsageError if the recording cannot be read, has fewer than 2 ticks, or the PNG cannot be
     written.
     """
-    recording = read_recording(recording_path)
+    plot_recording(read_recording(recording_path), png_path)
+
+
+def plot_recording(recording: Recording, png_path: Path) -> None:
+    """As `plot_run`, for a recording that is in memory."""
     figure = draw_run(recording)
     try:
         png_path.parent.mkdir(parents=True, exist_ok=True)
