@@ -43,6 +43,9 @@ from wire.run_config import NodeConfig
 
 BATCH_NS = 250_000_000
 """Telemetry does not wait longer than this for a batch to fill, while ticks go on."""
+PLANT_PATIENCE = 3.0
+"""Between two ticks a node waits this many deadlines: the plant, which has its own, should speak
+first."""
 FAREWELL_S = 5.0
 """A node started by hand stays this long after the end, so that its last batch gets through."""
 
@@ -173,15 +176,17 @@ class NodeProcess:
         """Main thread: until stopped, see that no tick takes longer than its deadline."""
         limit_s = self._config.links.deadline_s
         while not (self._stop or self._failure or self._child.stopping):
-            began = self._segment.began_ns
+            began, ended = self._segment.began_ns, self._segment.ended_ns
             if began:
                 left = limit_s - (monotonic_ns() - began) * 1e-9
-                if left <= 0.0:
-                    self._late(began)
-                    continue
-                self._child.wait(left)
+            elif ended:
+                left = PLANT_PATIENCE * limit_s - (monotonic_ns() - ended) * 1e-9
             else:
-                self._child.wait(limit_s)
+                left = limit_s  # the first measurement comes when the launcher says so
+            if left <= 0.0:
+                self._late(began)
+            else:
+                self._child.wait(left)
         if self._failure:
             code, text = self._failure
             self._child.status("failed", code=code, message=text, tick=self._segment.tick)
@@ -198,11 +203,12 @@ class NodeProcess:
         with self._lock:
             if self._segment.began_ns != began_ns:
                 return  # finished in the meantime
-            missing = self._segment.missing()
+            missing = self._segment.missing() if began_ns else ["the measurement of the plant"]
             tick = self._segment.tick
+        limit_s = self._config.links.deadline_s * (1.0 if began_ns else PLANT_PATIENCE)
         self._failure = (
             "deadline",
-            f"tick {tick}: node {self._config.index} waited {self._config.links.deadline_s:g} s "
+            f"tick {tick}: node {self._config.index} waited {limit_s:g} s "
             f"for {' and '.join(missing)}",
         )
 

@@ -43,6 +43,8 @@ class Segment:
         self.tick = 0
         self.began_ns = 0
         """When the first message of this tick came; 0 between two ticks."""
+        self.ended_ns = 0
+        """When the last tick ended; 0 before the first has."""
         self._sweep = sweep
         self._index = sweep.index
         self._first = sweep.index == 0
@@ -143,6 +145,7 @@ class Segment:
         self._record(self.tick, row)
         self._sweep.accept(output)
         self.tick += 1
+        self.ended_ns = sent_ns
         self._reset()
 
     def _finite(self, array: Array, field: str) -> list[float]:

@@ -19,7 +19,7 @@ from wire.child import Child, die_with_parent, name_process, send_status
 from wire.errors import ExitCode, OctarmError
 from wire.run_config import NodeConfig, loads
 
-GRACE_S = 2.0
+GRACE_S = 1.0
 """Between the request to end and the end by force, when the zygote itself has to stop its nodes."""
 
 
@@ -35,7 +35,8 @@ def serve(parent: int) -> int:
     child.status("up")
     while not child.stopping:
         for line in child.wait_lines(None):
-            _birth(line, child, alive)
+            if not child.stopping:
+                _birth(line, child, alive)
         _reap(child, alive)
     _end(child, alive)
     return 0

@@ -15,11 +15,15 @@ from wire.child import Child, die_with_parent, name_process
 from wire.errors import ExitCode, OctarmError
 from wire.run_config import RecorderConfig, loads
 
+NICENESS = 10
+"""Records can wait for a core, the sums cannot."""
+
 
 def main() -> int:
     """Run the recorder; returns the exit code."""
     die_with_parent(int(sys.argv[1]) if len(sys.argv) > 1 else os.getppid())
     name_process("octarm-recorder")
+    os.nice(NICENESS)
     child = Child("recorder", control=0, status=1, directory=None)
     child.install(reads_control=True)
     try:

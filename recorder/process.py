@@ -83,7 +83,6 @@ class RecorderProcess:
             samples = session.declare_subscriber(keys.all_telemetry, handler)
             self._child.status("up")
             finish: Deadline | None = None
-            told = False
             while True:
                 for message in self._child.wait(POLL_S):
                     if message.get("do") == "finish":
@@ -94,11 +93,11 @@ class RecorderProcess:
                             (message["tick"], message["level"], message["name"], message["message"])
                         )
                 self._drain(samples)
+                if finish and monotonic() - self._told_at > PROGRESS_S:
+                    self._told_at = monotonic()
+                    self._child.status("writing", tick=self._written)
                 # Lasting signals only end the wait for others: the file is closed in any case.
                 waiting = [s for s in self._merge.waiting_for() if s not in self._silent]
-                if not waiting and not told:
-                    told = True
-                    self._child.status("complete", tick=self._written)
                 if finish and (not waiting or finish.passed):
                     break
                 if self._child.stopping and (self._child.orphaned or finish is None):

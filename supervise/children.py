@@ -23,13 +23,15 @@ PYTHON_ROOT = Path(__file__).resolve().parent.parent
 class Handle:
     """A process that this run started, directly or through the zygote, by pidfd."""
 
-    def __init__(self, name: str, pid: int) -> None:
+    def __init__(self, name: str, pid: int, parent: int) -> None:
         self.name = name
         self.pid = pid
-        try:
+        self._fd = -1
+        with contextlib.suppress(OSError):
             self._fd = os.pidfd_open(pid)
-        except ProcessLookupError:
-            self._fd = -1
+        # The number may have passed to a stranger before it was opened: then it has another parent.
+        if _parent_of(pid) != parent:
+            self.close()
 
     def fileno(self) -> int:
         """The pidfd: readable when the process has ended; -1 if it is gone."""
@@ -73,7 +75,7 @@ class Process(Handle):
             env=environment,
             start_new_session=True,  # Ctrl-C is for the launcher, which ends the others in order
         )
-        super().__init__(name, self._popen.pid)
+        super().__init__(name, self._popen.pid, os.getpid())
         if self._popen.stdin is None or self._popen.stdout is None:
             raise RuntimeError("a pipe to a child is missing")
         self.control = self._popen.stdin
@@ -115,6 +117,14 @@ class Process(Handle):
                 with contextlib.suppress(OSError):
                     pipe.close()
         super().close()
+
+
+def _parent_of(pid: int) -> int | None:
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return None
+    return int(stat.rpartition(")")[2].split()[1])
 
 
 def ending(code: int | None) -> str:

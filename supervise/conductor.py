@@ -12,48 +12,35 @@ import contextlib
 import os
 import selectors
 import signal
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import monotonic
 from typing import Any, Self
 
 from supervise.children import Handle, Process, ending
 from supervise.plan import Plan
+from supervise.state import Outcome, RunState
 from supervise.view import View
 from wire.child import Deadline
 from wire.errors import ExitCode, OctarmError, StartUpTimeoutError
 from wire.run_config import dumps
 
-REPORT_S = 2.0
+REPORT_S = 1.0
 """After the order to stop: for the nodes to say where they stood."""
 RECORD_S = 30.0
 """For the recorder to write what is waiting, when everybody is well."""
-RECORD_FAULT_S = 3.0
+RECORD_FAULT_S = 2.0
 """The same when somebody is dead or frozen."""
-GRACE_S = 2.0
+RECORDER_SILENT_S = 5.0
+"""A recorder that says nothing for so long, while it should be writing, is given up."""
+ZYGOTE_GRACE_S = 5.0
+"""The zygote needs more: it ends its own children first."""
+GRACE_S = 1.0
 """Between SIGINT, SIGTERM and SIGKILL."""
 
 
 class Interrupted(Exception):  # noqa: N818 - not an error
     """Ctrl-C or SIGTERM."""
-
-
-@dataclass
-class Outcome:
-    """How a run ended."""
-
-    exit_code: ExitCode
-    message: str
-    """What went wrong and what to do; empty when all is well."""
-    ticks: int
-    """Ticks that the plant finished."""
-    startup_s: float
-    """From the first process to all links up."""
-    run_s: float
-    """From the first tick to the last."""
-    totals: dict[str, int] = field(default_factory=dict)
-    """The recorder's counters."""
 
 
 class Conductor:
@@ -68,21 +55,9 @@ class Conductor:
         self._zygote: Process | None = None
         self._plant: Process | None = None
         self._recorder: Process | None = None
-        self._nodes: dict[int, Handle] = {}
-        self._linked: set[int] = set()
-        self._missing: dict[str, list[str]] = {}
-        """What each process that is up still waits for."""
-        self._ready: set[str] = set()
-        self._stopped: dict[int, dict[str, Any]] = {}
-        self._ended: dict[str, str] = {}
-        """Processes that ended without being asked: name and how."""
-        self._failures: list[tuple[str, str]] = []
-        self._plant_stop: dict[str, Any] | None = None
-        self._complete = False
-        self._closed: dict[str, Any] | None = None
+        self._state = RunState(plan)
         self._interrupts = 0
         self._leaving = False
-        self._ticks = 0
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     # -- life -------------------------------------------------------------------------------------
@@ -124,25 +99,26 @@ class Conductor:
     # -- the whole run ----------------------------------------------------------------------------
 
     def run(self) -> Outcome:
-        """Start, link, run, stop; raises OctarmError if it never came to the first tick, or
-        Interrupted."""
+        """Start, link, run, stop; raises OctarmError if it never came to the first tick.
+
+        Interrupted is raised instead if the user asked for the end before.
+        """
         began = monotonic()
         self._spawn()
         self._wait_linked(Deadline(self._plan.start_timeout_s))
-        startup_s = monotonic() - began
-        self._view.note(
-            f"{self._plan.run.nodes} nodes, plant and recorder linked in {startup_s:.2f} s"
-        )
-        self._event(0, "info", "started", f"{self._plan.run.nodes} nodes linked")
+        nodes = self._plan.run.nodes
+        self._view.note(f"{nodes} nodes, plant and recorder linked in {monotonic() - began:.2f} s")
+        self._event(0, "info", "started", f"{nodes} nodes linked")
         self._order(self._plant, do="start")
         first = monotonic()
         self._watch()
         run_s = monotonic() - first
-        code, message, tick = self._judge()
-        self._record_end(code, message, tick)
-        if code is ExitCode.OK and (trouble := self._recording_trouble()):
+        self._collect_reports()
+        code, message, tick = self._state.verdict(interrupted=self._interrupts > 0)
+        self._finish_recording(code, message, tick)
+        if code is ExitCode.OK and (trouble := self._state.recording_trouble()):
             code, message = ExitCode.DEGRADED, trouble
-        return Outcome(code, message, self._ticks, startup_s, run_s, self._totals())
+        return Outcome(code, message, tick, run_s)
 
     def _spawn(self) -> None:
         plan = self._plan
@@ -167,178 +143,96 @@ class Conductor:
         return process
 
     def _wait_linked(self, limit: Deadline) -> None:
-        while not self._all_linked():
+        state = self._state
+        while not state.all_linked:
             self._turn(min(limit.left, 1.0))
             if self._interrupts:
                 raise Interrupted
-            if self._failures or self._ended:
-                raise self._start_error()
+            if state.failures or state.ended:
+                self._turn(0.05)  # the others may know more
+                raise OctarmError(
+                    f"start-up failed: {state.why_not_started()}; see {self._log_path}"
+                )
             if limit.passed:
-                raise StartUpTimeoutError(self._who_is_missing())
-
-    def _all_linked(self) -> bool:
-        return len(self._linked) == self._plan.run.nodes - len(self._plan.by_hand) and (
-            "plant" in self._ready
-        )
-
-    def _who_is_missing(self) -> str:
-        parts: list[str] = []
-        for i in range(self._plan.run.nodes):
-            if i in self._linked:
-                continue
-            name = f"node {i}"
-            if name in self._missing:
-                parts.append(f"{name} waits for {', '.join(self._missing[name])}")
-            elif i in self._plan.by_hand:
-                parts.append(f"{name} was not started (it is yours: --by-hand)")
-            else:
-                parts.append(f"{name} does not answer")
-        for process in (self._plant, self._recorder):
-            if process is not None and process.name not in self._ready:
-                waits = self._missing.get(process.name)
-                if waits is None:
-                    parts.append(f"{process.name} does not answer")
-                elif not parts:
-                    parts.append(f"{process.name} waits for {', '.join(waits)}")
-        shown = "; ".join(parts[:6]) + (f"; and {len(parts) - 6} more" if len(parts) > 6 else "")
-        return (
-            f"not every link was up after {self._plan.start_timeout_s:g} s: {shown}; see "
-            f"{self._log_path} or give more time with --start-timeout"
-        )
-
-    def _start_error(self) -> OctarmError:
-        if self._failures:
-            text = "; ".join(dict.fromkeys(text for _, text in self._failures))
-        else:
-            text = "; ".join(f"{name} {how}" for name, how in self._ended.items())
-        self._turn(0.05)
-        return OctarmError(f"start-up failed: {text}; see {self._log_path}")
+                raise StartUpTimeoutError(
+                    f"not every link was up after {self._plan.start_timeout_s:g} s: "
+                    f"{state.who_is_missing()}; give more time with --start-timeout or see "
+                    f"{self._log_path}"
+                )
 
     def _watch(self) -> None:
         """Until the plant has stopped, or cannot any more."""
+        state = self._state
         ordered: Deadline | None = None
-        while self._plant_stop is None and "plant" not in self._ended:
+        while state.plant_stop is None and "plant" not in state.ended:
             if ordered is None:
-                order = self._reason_to_stop()
-                if order is not None:
-                    self._order(self._plant, do="stop", cause=order[0], text=order[1])
+                cause, reason = "safety", state.reason_to_stop()
+                if self._interrupts:
+                    cause, reason = "interrupted", "interrupted by the user"
+                if reason is not None:
+                    self._order(self._plant, do="stop", cause=cause, text=reason)
                     ordered = Deadline(REPORT_S)
             self._turn(0.5 if ordered is None else min(0.5, ordered.left))
             if ordered is not None and ordered.passed:
-                break
-
-    def _reason_to_stop(self) -> tuple[str, str] | None:
-        if self._interrupts:
-            return "interrupted", "interrupted by the user"
-        if self._failures:
-            return "safety", self._failures[0][1]
-        dead = [name for name in self._ended if name != "recorder"]
-        if dead:
-            return "safety", f"{dead[0]} {self._ended[dead[0]]}"
-        return None
-
-    def _judge(self) -> tuple[ExitCode, str, int]:
-        """What the end of the run means: exit code, message, first tick not done."""
-        stop = self._plant_stop
-        if stop is None:
-            how = self._ended.get("plant", "does not answer")
-            tick = max([self._ticks, *(s["tick"] for s in self._stopped.values())])
-            return ExitCode.SAFETY_STOP, f"the plant {how}: the run was stopped", tick
-        tick = int(stop["tick"])
-        self._ticks = tick
-        if stop["cause"] == "finished":
-            return ExitCode.OK, "", tick
-        if self._interrupts:
-            return ExitCode.INTERRUPTED, f"interrupted at tick {tick}", tick
-        self._collect_reports()
-        text = stop["text"]
-        if not text.startswith("tick"):
-            text = f"tick {tick}: {text}"
-        details = [
-            f"node {i} lacked the {' and the '.join(report['missing'])}"
-            for i, report in sorted(self._stopped.items())
-            if report["missing"] and f"node {i} waited" not in text
-        ]
-        silent = [
-            f"node {i} does not answer"
-            for i, handle in sorted(self._nodes.items())
-            if i not in self._stopped and handle.alive
-        ]
-        more = "; ".join((silent + details)[:4])
-        return ExitCode.SAFETY_STOP, f"safety stop: {text}" + (f" ({more})" if more else ""), tick
+                return
 
     def _collect_reports(self) -> None:
-        limit = Deadline(REPORT_S)
-        while not limit.passed and any(
-            handle.alive and i not in self._stopped for i, handle in self._nodes.items()
-        ):
+        """After the plant's order to stop: let the nodes say where they stood."""
+        limit = Deadline(REPORT_S if self._state.plant_stop is not None else 0.0)
+        while not limit.passed and self._state.unheard:
             self._turn(min(0.2, limit.left))
 
     # -- the end ----------------------------------------------------------------------------------
 
-    def _record_end(self, code: ExitCode, message: str, tick: int) -> None:
+    def _finish_recording(self, code: ExitCode, message: str, tick: int) -> None:
         """Let the recorder write everything that is on its way, and close the file."""
         names = {
             ExitCode.OK: ("info", "finished", f"all {tick} ticks done"),
             ExitCode.INTERRUPTED: ("warning", "interrupted", message),
         }
         self._event(tick, *names.get(code, ("error", "safety_stop", message)))
-        well = code in (ExitCode.OK, ExitCode.INTERRUPTED)
-        if not well:
-            self._collect_reports()
-        dead = [i for i, h in self._nodes.items() if not h.alive and i not in self._stopped]
-        if self._plant_stop is None:
-            dead.append(-1)
-        seconds = RECORD_S if well else RECORD_FAULT_S
-        self._order(self._recorder, do="finish", seconds=seconds, dead=dead)
-        limit = Deadline(seconds + RECORD_S)
-        while self._closed is None and "recorder" not in self._ended and not limit.passed:
-            self._turn(min(0.5, limit.left))
-            if self._interrupts > 1:
+        seconds = RECORD_S if code in names else RECORD_FAULT_S
+        self._order(self._recorder, do="finish", seconds=seconds, dead=self._state.silent)
+        # It reports while it writes, however long that takes; without a word it is frozen.
+        state = self._state
+        state.recorder_spoke = monotonic()
+        while state.closed is None and "recorder" not in state.ended:
+            self._turn(0.2)
+            if self._interrupts > 1 or monotonic() - state.recorder_spoke > RECORDER_SILENT_S:
                 return
-
-    def _recording_trouble(self) -> str:
-        where = self._plan.recorder.path
-        if "recorder" in self._ended:
-            return f"the recorder {self._ended['recorder']}: {where} can be read up to there"
-        if self._closed is None:
-            return f"the recorder did not finish: {where} may end early"
-        run, lost = self._plan.run, int(self._closed["ticks_lost"])
-        if lost or self._closed["ticks_recorded"] < run.ticks:
-            return f"{where}: records of {lost} node ticks were lost"
-        return ""
-
-    def _totals(self) -> dict[str, int]:
-        skip = ("from", "event")
-        return {k: v for k, v in (self._closed or {}).items() if k not in skip}
 
     def _end_all(self) -> None:
         """SIGINT, SIGTERM, SIGKILL, each with a grace, to what this run started and still lives."""
         self._order(self._plant, do="end")
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-            self._turn(0.0)
-            everybody = [*self._nodes.values(), self._plant, self._recorder]
-            if not any(h is not None and h.alive for h in everybody):
-                break
-            for handle in everybody:
-                if handle is not None and handle.alive:
-                    handle.signal(number)
-            limit = Deadline(GRACE_S if self._interrupts < 2 else 0.2)
-            while not limit.passed and any(h is not None and h.alive for h in everybody):
-                self._turn(min(0.05, limit.left))
-        for number in (signal.SIGTERM, signal.SIGKILL):
-            if self._zygote is not None and self._zygote.alive:
-                self._zygote.signal(number)
-                limit = Deadline(GRACE_S)
-                while self._zygote.alive and not limit.passed:
-                    self._turn(min(0.05, limit.left))
+            self._end(number, [*self._state.nodes.values(), self._plant, self._recorder])
+        # Last the zygote, which ends whatever it has forked in the meantime.
+        if self._zygote is not None:
+            self._zygote.control.close()
+        self._end(signal.SIGTERM, [self._zygote], ZYGOTE_GRACE_S)
+        self._end(signal.SIGKILL, [self._zygote, *self._state.nodes.values()])
         for process in (self._zygote, self._plant, self._recorder):
             if process is not None:
                 self._forget(process)
                 process.reap()
                 process.close()
-        for handle in self._nodes.values():
+        for handle in self._state.nodes.values():
             handle.close()
+
+    def _end(
+        self,
+        number: signal.Signals,
+        handles: Sequence[Handle | None],
+        grace_s: float = GRACE_S,
+    ) -> None:
+        """Send a signal to those that live, and give them time."""
+        self._turn(0.0)
+        living = [handle for handle in handles if handle is not None and handle.alive]
+        for handle in living:
+            handle.signal(number)
+        limit = Deadline(grace_s if self._interrupts < 2 else 0.2)
+        while not limit.passed and any(handle.alive for handle in living):
+            self._turn(min(0.05, limit.left))
 
     # -- events -----------------------------------------------------------------------------------
 
@@ -363,9 +257,11 @@ class Conductor:
             self._selector.unregister(process)
         except KeyError:
             return
-        expected = self._leaving or (process is self._recorder and self._closed is not None)
+        expected = self._leaving or (process is self._recorder and self._state.closed is not None)
         if not expected:
-            self._ended[process.name] = ending(code)
+            self._state.ended[process.name] = ending(code)
+            if process is self._recorder and self._state.all_linked:
+                self._view.note(f"the recorder {ending(code)}: the run goes on unrecorded")
 
     def _read(self, process: Process) -> None:
         lines = process.lines()
@@ -377,44 +273,22 @@ class Conductor:
             self._handle(line)
 
     def _handle(self, line: dict[str, Any]) -> None:
-        name, event = line["from"], line["event"]
-        node = int(name[5:]) if name.startswith("node ") else -1
-        match event:
-            case "born":
-                self._nodes[line["node"]] = Handle(f"node {line['node']}", line["pid"])
-            case "died":
-                if not self._leaving:
-                    self._ended[f"node {line['node']}"] = ending(line["code"])
-            case "waiting":
-                self._missing[name] = line["missing"]
-            case "ready":
-                self._ready.add(name)
-                if node >= 0:
-                    self._linked.add(node)
-            case "up":
-                self._missing.setdefault(name, ["its links"])
-                if name == "recorder":
-                    self._ready.add(name)
-            case "failed":
-                self._failures.append((name, line["message"]))
+        state = self._state
+        state.hear(line)
+        match line["event"]:
+            case "born" if self._zygote is not None:
+                node = line["node"]
+                state.nodes[node] = Handle(f"node {node}", line["pid"], parent=self._zygote.pid)
+            case "died" if not self._leaving:
+                state.ended[f"node {line['node']}"] = ending(line["code"])
+            case "progress" if line["from"] == "plant":
+                self._view.progress(line["tick"])
             case "progress":
-                if name == "plant":
-                    self._ticks = line["tick"]
-                    self._view.progress(line["tick"])
-                else:
-                    self._view.errors(line["tip_error_m"], line["estimation_error"])
-            case "stopped":
-                if name == "plant":
-                    self._plant_stop = line
-                    self._view.progress(line["tick"])
-                else:
-                    self._stopped[node] = line
-            case "complete":
-                self._complete = True
-            case "closed":
-                self._closed = line
+                self._view.errors(line["tip_error_m"], line["estimation_error"])
+            case "stopped" if line["from"] == "plant":
+                self._view.progress(line["tick"])
             case "note":
-                self._view.note(f"{name}: {line['text']}")
+                self._view.note(f"{line['from']}: {line['text']}")
 
     def _order(self, process: Process | None, **message: Any) -> None:
         if process is not None and process.alive:

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from supervise.conductor import Conductor, Interrupted, Outcome, log_of
+from supervise.conductor import Conductor, Interrupted, log_of
 from supervise.endpoints import choose
 from supervise.plan import Plan, RunOptions, make_plan, new_run_id, prepare
+from supervise.state import Outcome
 from supervise.view import View, choose_view
 from wire.errors import ExitCode, UsageError
 
@@ -60,7 +61,7 @@ def _conduct(plan: Plan, view: View) -> Outcome:
             return conductor.run()
         except Interrupted:
             text = "interrupted before the first tick"
-            return Outcome(ExitCode.INTERRUPTED, text, 0, 0.0, 0.0)
+            return Outcome(ExitCode.INTERRUPTED, text, 0, 0.0)
 
 
 def _make_directory(out: Path | None, run_id: str) -> tuple[Path, bool]:
