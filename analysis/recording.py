@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import msgspec
@@ -23,9 +24,11 @@ from wire.artefact import FORMAT as GAINS_FORMAT
 from wire.artefact import GainsArtefact, read_artefact
 from wire.channels import (
     COMMAND,
+    EVENTS,
     FORMAT_VERSION,
     MEASUREMENT,
     METADATA,
+    SHAPE,
     SHAPE_POINTS,
     STATE,
     SUMMARY,
@@ -38,6 +41,8 @@ Array = npt.NDArray[np.float64]
 
 QUANTITIES = (*STATE, *COMMAND)
 """What a node computes each tick, in the order of the dense step's output."""
+_FLOW = ("messages", "bytes", "crc32")
+_ENDINGS = ("finished", "interrupted", "safety_stop")
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +121,7 @@ class Recording:
     @cached_property
     def shapes_m(self) -> Array:
         """Points along the arm from root to tip, (K, points, 2)."""
-        fields = [f"{axis}{i:02d}_m" for i in range(SHAPE_POINTS) for axis in "xy"]
-        return self.of_plant("shape", fields).reshape(self.ticks, SHAPE_POINTS, 2)
+        return self.of_plant("shape", SHAPE).reshape(self.ticks, SHAPE_POINTS, 2)
 
     @cached_property
     def sweep_durations_ms(self) -> Array:
@@ -174,6 +178,30 @@ class Recording:
         if not all(counts):
             return None
         return sum(one.get(name, 0) for one in counts)
+
+    def intact_links(self) -> int | None:
+        """Directed links between neighbours whose two ends saw the same bytes in the same order.
+
+        2 (n - 1) if everything that was sent arrived unaltered; None unless every node has sent its
+        counters.
+        """
+        counts = [self.process_counters(f"node/{self._label(i)}") for i in self._indices]
+        if not all(counts):
+            return None
+        pairs = [("forward", a, b) for a, b in pairwise(counts)]
+        pairs += [("backward", b, a) for a, b in pairwise(counts)]
+        return sum(
+            all(a.get(f"{way}_sent_{what}") == b.get(f"{way}_received_{what}") for what in _FLOW)
+            for way, a, b in pairs
+        )
+
+    def ending(self) -> str | None:
+        """How the run ended: "finished", "interrupted", "safety_stop"; None if it does not say."""
+        table = self.tables.get(EVENTS.topic)
+        if table is None or not table.rows:
+            return None
+        names = [name for name in table.column("name") if name in _ENDINGS]
+        return names[-1] if names else None
 
     @property
     def _indices(self) -> range:

@@ -44,13 +44,14 @@ def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
         (
             "run",
             f"{s['nodes']} nodes, {s['ticks']}{short} ticks of {s['tick_s']:g} s",
-            f"{seconds:g} s of the arm's time; setpoint {s['setpoint']}, seed {s['seed']}",
+            f"{seconds:g} s of the arm's time; setpoint {s['setpoint']}, seed {s['seed']}"
+            + ("" if s["ended"] == "finished" else f"; ended: {s['ended'] or 'unknown'}"),
         ),
         (
             "neighbour messages",
             _traffic(s),
-            f"counted by the receivers; 2 (n - 1) = {s['neighbour_messages_expected_per_tick']} "
-            "are expected",
+            f"counted by receivers; 2 (n - 1) = {s['neighbour_messages_expected_per_tick']} "
+            f"expected; links intact: {_count(s['intact_links'])}",
         ),
         ("message size", _number(s["bytes_per_message"], "B", 4), "mean, on the wire"),
         (

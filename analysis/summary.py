@@ -94,6 +94,7 @@ def summary_of(recording: Recording) -> dict[str, Any]:
             "controller": _gamma(setpoint.controller_certificate),
         },
         "artefact_sha256": run.artefact_sha256,
+        "ended": recording.ending(),
         "recording": str(recording.path),
         "recording_complete": recording.unfinished is None and recording.counters is not None,
         "recording_stops": recording.unfinished,
@@ -115,8 +116,10 @@ def _traffic(recording: Recording) -> dict[str, Any]:
     nodes = recording.nodes
     neighbours = recording.counter("neighbour_messages")
     size = recording.counter("neighbour_bytes")
-    done = recording.counter("ticks_recorded")
+    reporting = recording.counter("nodes_reporting")
+    done = recording.counter("ticks_recorded") if reporting == nodes else None
     return {
+        "nodes_reporting": reporting,
         "neighbour_messages": neighbours,
         "neighbour_messages_sent": recording.counter("neighbour_messages_sent"),
         "neighbour_messages_per_tick": _ratio(neighbours, done),
@@ -128,6 +131,7 @@ def _traffic(recording: Recording) -> dict[str, Any]:
             "measurement": recording.counter("measurement_messages"),
             "command": recording.counter("command_messages"),
         },
+        "intact_links": recording.intact_links(),
         "rejected_messages": recording.counter("rejected_messages"),
         "ticks_lost": recording.counter("ticks_lost"),
     }

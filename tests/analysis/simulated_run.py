@@ -276,10 +276,16 @@ def summary(run: RunConfig) -> dict[str, str]:
     }
     out = {name: str(value) for name, value in totals.items()}
     for i in range(n):
-        counters = {
-            "forward_received_messages": ticks * (i > 0),
-            "backward_received_messages": ticks * (i < n - 1),
-            "rejected_messages": 0,
+        flows = {
+            "forward_received": (i > 0, i - 1),
+            "forward_sent": (i < n - 1, i),
+            "backward_received": (i < n - 1, i),
+            "backward_sent": (i > 0, i - 1),
         }
+        counters = {"rejected_messages": 0}
+        for name, (there, link) in flows.items():
+            counters[f"{name}_messages"] = ticks * there
+            counters[f"{name}_bytes"] = ticks * there * BYTES_PER_MESSAGE
+            counters[f"{name}_crc32"] = (1000 + link) * there
         out[f"node/{label(i, n)}"] = json.dumps(counters)
     return out

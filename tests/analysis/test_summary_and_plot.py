@@ -1,5 +1,6 @@
 """What a run reports: every key with a plausible value, a table for a person, a picture."""
 
+import dataclasses
 import json
 import math
 import re
@@ -48,9 +49,22 @@ def test_the_summary_has_what_the_command_line_promises(path: Path) -> None:
     assert summary["estimation_below_1_percent_s"] == {"observer": None, "open_loop_model": None}
     assert summary["gamma"]["observer"] == {"certified": 0.1414, "achieved": 0.135}
     assert summary["rejected_messages"] == 0
+    assert summary["intact_links"] == 6
+    assert summary["ended"] == "finished"
     assert summary["recording"] == str(path)
     assert summary["recording_complete"] is True
     assert len(summary["artefact_sha256"]) == 64
+
+
+def test_a_link_that_lost_or_altered_something_is_not_counted_as_intact(path: Path) -> None:
+    recording = read_recording(path)
+    assert recording.counters is not None
+    for field, changed in (("forward_received_crc32", 4), ("forward_received_messages", 239)):
+        counters = json.loads(recording.counters["node/02"]) | {field: changed}
+        altered = {**recording.counters, "node/02": json.dumps(counters)}
+        assert dataclasses.replace(recording, counters=altered).intact_links() == 5
+    silent = {k: v for k, v in recording.counters.items() if k != "node/01"}
+    assert dataclasses.replace(recording, counters=silent).intact_links() is None
 
 
 def test_the_estimation_error_is_the_energy_of_the_difference(path: Path) -> None:
