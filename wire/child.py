@@ -80,6 +80,10 @@ class Child:
             signal.signal(number, self._on_signal)
         signal.signal(signal.SIGPIPE, signal.SIG_IGN)
         signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
+        self.watch(reads_control=reads_control)
+
+    def watch(self, *, reads_control: bool) -> None:
+        """Watch the lifeline without touching the process's signals."""
         if self._control >= 0:
             self._poll.register(self._control, select.POLLIN if reads_control else 0)
 
@@ -141,6 +145,11 @@ class Child:
     def status(self, event: str, **fields: Any) -> None:
         """Tell the launcher."""
         send_status(self._status, self.name, event, **fields)
+
+    def close(self) -> None:
+        """Give the wake-up pipe back."""
+        os.close(self._read)
+        os.close(self._write)
 
     def leave(self, endpoints: list[str]) -> None:
         """Remove this process's sockets, and the whole private directory if the launcher is

@@ -1,0 +1,153 @@
+"""Runs of the real command line in processes of their own, each leaving nothing behind."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+import selectors
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from closed_form import write_gains
+
+ROOT = Path(__file__).resolve().parents[2]
+MARK = "OCTARM_TEST_RUN"
+PATIENCE_S = 60.0
+
+
+class Cli:
+    """One `octarm` process. Everything it starts carries a mark in its environment."""
+
+    def __init__(self, work: Path, arguments: list[str]) -> None:
+        """`arguments` follow the interpreter's name."""
+        self.mark = secrets.token_hex(8)
+        self.work = work
+        self.sockets = Path(tempfile.mkdtemp(prefix="ot-"))
+        environment = {**os.environ, MARK: self.mark, "TMPDIR": str(self.sockets)}
+        environment.pop("COLUMNS", None)
+        self.popen = subprocess.Popen(
+            [sys.executable, *arguments],
+            cwd=work,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        self.out = ""
+        self.err = ""
+
+    def processes(self) -> dict[str, int]:
+        """Name and number of every living process with this run's mark."""
+        found: dict[str, int] = {}
+        wanted = f"{MARK}={self.mark}".encode()
+        for directory in Path("/proc").iterdir():
+            if not directory.name.isdigit():
+                continue
+            with contextlib.suppress(OSError):
+                if wanted not in (directory / "environ").read_bytes().split(b"\0"):
+                    continue
+                state = (directory / "stat").read_text().rpartition(")")[2].split()[0]
+                if state not in "ZX":
+                    name = (directory / "comm").read_text().strip()
+                    name = "launcher" if int(directory.name) == self.popen.pid else name
+                    found[name] = int(directory.name)
+        return found
+
+    def wait_for(self, text: str) -> None:
+        """Read standard error until a line begins with the text."""
+        assert self.popen.stderr is not None
+        descriptor = self.popen.stderr.fileno()
+        limit = time.monotonic() + PATIENCE_S
+        with selectors.DefaultSelector() as selector:
+            selector.register(descriptor, selectors.EVENT_READ)
+            while not any(line.startswith(text) for line in self.err.splitlines()):
+                assert time.monotonic() < limit, f"no line {text!r} in:\n{self.err}"
+                if selector.select(1.0):
+                    data = os.read(descriptor, 65536)
+                    assert data, f"ended without a line {text!r}:\n{self.err}"
+                    self.err += data.decode()
+
+    def finish(self) -> int:
+        """Wait for the end; returns the exit code."""
+        out, err = self.popen.communicate(timeout=PATIENCE_S)
+        self.out += (out or b"").decode()
+        self.err += err.decode()
+        return self.popen.returncode
+
+    def json(self) -> dict[str, Any]:
+        """The one object on standard output."""
+        value = json.loads(self.out)
+        assert isinstance(value, dict)
+        return value
+
+    def recording(self) -> Path:
+        (found,) = self.work.glob("**/recording.mcap")
+        return found
+
+    def gone(self, seconds: float = 3.0) -> dict[str, int]:
+        """Processes that still live after so long: none, if all is well."""
+        limit = time.monotonic() + seconds
+        while (left := self.processes()) and time.monotonic() < limit:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.popen.wait(0.05)
+        return left
+
+    def close(self) -> None:
+        for pid in self.processes().values():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self.popen.wait(10)
+        for pipe in (self.popen.stdout, self.popen.stderr):
+            if pipe is not None:
+                pipe.close()
+        shutil.rmtree(self.sockets, ignore_errors=True)
+
+
+class Start:
+    """Starts command lines in directories of their own."""
+
+    def __init__(self, work: Path, gains: Path) -> None:
+        self.work = work
+        self.gains = gains
+        self.started: list[Cli] = []
+
+    def __call__(self, *arguments: str | Path) -> Cli:
+        work = self.work / f"run{len(self.started)}"
+        work.mkdir()
+        cli = Cli(work, [str(ROOT / "launcher.py"), *map(str, arguments)])
+        self.started.append(cli)
+        return cli
+
+    def node(self, configuration: str) -> Cli:
+        """`python -m node`, as a user would type it."""
+        cli = Cli(ROOT, ["-m", "node", configuration])
+        self.started.append(cli)
+        return cli
+
+    def run(self, *arguments: str | Path) -> Cli:
+        """`octarm run` with the test's gains."""
+        return self("run", "--gains", self.gains, *arguments)
+
+
+@pytest.fixture(scope="session")
+def gains(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_gains(tmp_path_factory.mktemp("gains") / "test.gains.json")
+
+
+@pytest.fixture
+def start(tmp_path: Path, gains: Path) -> Iterator[Start]:
+    starter = Start(tmp_path, gains)
+    try:
+        yield starter
+    finally:
+        for cli in starter.started:
+            cli.close()

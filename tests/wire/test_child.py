@@ -1,0 +1,90 @@
+"""Status lines, control lines and waiting of a child process, over real pipes."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
+
+import pytest
+
+from wire.child import LINE_LIMIT, Child, Deadline, remove_sockets
+
+
+@dataclass
+class Pipes:
+    child: Child
+    control: int
+    status: int
+
+    def said(self) -> dict[str, object]:
+        value = json.loads(os.read(self.status, 1 << 16))
+        assert isinstance(value, dict)
+        return value
+
+
+@pytest.fixture
+def pipes(tmp_path: Path) -> Iterator[Pipes]:
+    control_read, control_write = os.pipe()
+    status_read, status_write = os.pipe()
+    child = Child("node 1", control=control_read, status=status_write, directory=str(tmp_path))
+    child.watch(reads_control=True)
+    yield Pipes(child, control_write, status_read)
+    for fd in (control_read, control_write, status_read, status_write):
+        try:
+            os.close(fd)
+        except OSError:
+            continue
+    child.close()
+
+
+def test_control_lines_come_whole_and_in_order(pipes: Pipes) -> None:
+    os.write(pipes.control, b'{"do":"start"}\n{"do":')
+    assert pipes.child.wait(1.0) == [{"do": "start"}]
+    os.write(pipes.control, b'"stop"}\n')
+    assert pipes.child.wait(1.0) == [{"do": "stop"}]
+
+
+def test_lines_behind_the_configuration_are_not_lost(pipes: Pipes) -> None:
+    os.write(pipes.control, b'{"a":1}\n{"do":"start"}\n{"do":"stop"}\n')
+    assert json.loads(pipes.child.configuration()) == {"a": 1}
+    assert pipes.child.wait(1.0) == [{"do": "start"}, {"do": "stop"}]
+
+
+def test_the_end_of_the_lifeline_is_noticed(pipes: Pipes, tmp_path: Path) -> None:
+    (tmp_path / "socket").touch()
+    os.close(pipes.control)
+    assert pipes.child.wait(1.0) == []
+    assert pipes.child.orphaned
+    assert pipes.child.stopping
+    pipes.child.leave([])
+    assert not tmp_path.exists()
+
+
+def test_a_wake_up_from_another_thread_ends_the_wait(pipes: Pipes) -> None:
+    thread = Thread(target=pipes.child.wake)
+    deadline = Deadline(20.0)
+    thread.start()
+    assert pipes.child.wait(deadline.left) == []
+    assert not deadline.passed
+    thread.join()
+
+
+def test_status_lines_fit_into_one_write(pipes: Pipes) -> None:
+    pipes.child.status("failed", message="x" * 100_000, tick=3)
+    line = os.read(pipes.status, 1 << 20)
+    assert len(line) <= LINE_LIMIT + 1
+    said = json.loads(line)
+    assert (said["from"], said["event"], said["tick"]) == ("node 1", "failed", 3)
+    pipes.child.status("waiting", missing=["y" * 100] * 1000)
+    assert pipes.said() == {"from": "node 1", "event": "waiting"}
+
+
+def test_sockets_and_their_locks_are_removed(tmp_path: Path) -> None:
+    for name in ("node0", "node0.lock", "other"):
+        (tmp_path / name).touch()
+    remove_sockets([f"unixsock-stream/{tmp_path}/node0", "tcp/127.0.0.1:9"])
+    assert [p.name for p in tmp_path.iterdir()] == ["other"]
