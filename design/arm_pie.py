@@ -1,0 +1,114 @@
+"""The arm at a setpoint as a partial integral equation T f_t = A f + B w (theory, section 2).
+
+Nondimensional energy states x = (v_x, v_y, e, k): velocity in the fixed frame, axial strain times alpha,
+curvature perturbation; fundamental state f = (t.v' alpha, (n.v')', N'), so that the conservative part of
+the dynamics is a permutation of f and skew-adjoint for EVERY polynomial frame t, n. |x|^2 is twice the
+energy in units of EI / L.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from design import legendre
+from design.legendre import Array
+from design.operators import PIOperator, Shape, horizontal, vertical
+
+STATES = ("v_x", "v_y", "e", "k")
+PAIR = Shape(0, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class ArmPIE:
+    """T f_t = (conservative + dissipative) f; see `arm_pie`."""
+
+    alpha: float
+    drag: float
+    virtual: PIOperator
+    """K: strain rates (p, q) -> velocity, v(s) = int_0^s t p + int_0^s (int_z^s n) q dz."""
+    T: PIOperator
+    conservative: PIOperator
+    dissipative: PIOperator
+
+    @property
+    def A(self) -> PIOperator:
+        """The dynamics of the arm."""
+        return self.conservative + self.dissipative
+
+    @property
+    def A_adjoint(self) -> PIOperator:
+        """The adjoint system in the same T (theory, section 3, 'Controller without the trap')."""
+        return self.dissipative - self.conservative
+
+    @cached_property
+    def _compliance(self) -> PIOperator:
+        return PIOperator.multiplier(np.diag([1.0 / self.alpha, 1.0])[:, :, None])
+
+    def inverse(self, *, adjoint: bool = False) -> PIOperator:
+        """y = A^-1 x on the primary states (4 -> 4), or of the adjoint dynamics: the Krylov operator.
+
+        A y = x reads, with K sc the map from strains (e, k) to displacement:
+        y_v = +-K sc (e, k) and y_s = -+ sc K* (v + d y_v). It follows that y_t = x along the dynamics, so
+        rows built with it differentiate to rows already present (theory, section 3, point 1).
+        """
+        sign = -1.0 if adjoint else 1.0
+        to_displacement = self.virtual @ self._compliance
+        to_moment = self._compliance @ self.virtual.adjoint
+        identity = PIOperator.identity(Shape(0, 4))
+        velocity, strain = identity.rows([], [0, 1]), identity.rows([], [2, 3])
+        y_v = (to_displacement @ strain) * sign
+        y_s = (to_moment @ (velocity + y_v * self.drag)) * (-sign)
+        return vertical(y_v, y_s)
+
+
+def arm_pie(cosine: Array, sine: Array, alpha: float, drag: float) -> ArmPIE:
+    """Build the PIE from polynomial frame coefficients (orthonormal basis), alpha = L sqrt(EA/EI), drag d.
+
+    Raises ValueError if the frame's two polynomials differ in length.
+    """
+    if cosine.shape != sine.shape:
+        raise ValueError(
+            f"frame polynomials of lengths {cosine.size} and {sine.size}; expected equal"
+        )
+    size = cosine.size
+    step = legendre.integration(size, size + 1)
+    tangent = np.stack([cosine, sine])
+    normal_integral = np.stack([-(sine @ step), cosine @ step])
+    kernel = np.zeros((2, 2, size + 1, size + 1))
+    kernel[:, 0, 0, :size] = tangent
+    kernel[:, 1, :, 0] += normal_integral
+    kernel[:, 1, 0, :] -= normal_integral
+    zero = PIOperator.zeros(PAIR, PAIR)
+    one = PIOperator.identity(PAIR)
+    virtual = zero.replace(r1=kernel)
+    compliance = PIOperator.multiplier(np.diag([1.0 / alpha, 1.0])[:, :, None])
+    velocity = virtual @ compliance  # f carries alpha t.v', so that A has no large entries
+    return ArmPIE(
+        alpha=alpha,
+        drag=drag,
+        virtual=virtual,
+        T=vertical(
+            horizontal(velocity, zero), horizontal(zero, (compliance @ virtual.adjoint) * -1.0)
+        ),
+        conservative=vertical(horizontal(zero, one), horizontal(one, zero)),
+        dissipative=vertical(horizontal(velocity * -drag, zero), horizontal(zero, zero)),
+    )
+
+
+def functional(*states: str) -> PIOperator:
+    """x -> (int_0^1 x_i ds) for the named states: R^len(states) from 4 functions."""
+    q1 = np.zeros((len(states), 4, 1))
+    for row, name in enumerate(states):
+        q1[row, STATES.index(name), 0] = 1.0
+    return PIOperator.zeros(Shape(len(states), 0), Shape(0, 4)).replace(q1=q1)
+
+
+def selection(*states: str) -> PIOperator:
+    """x -> the named states as functions."""
+    r0 = np.zeros((len(states), 4, 1))
+    for row, name in enumerate(states):
+        r0[row, STATES.index(name), 0] = 1.0
+    return PIOperator.multiplier(r0)
