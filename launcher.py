@@ -235,9 +235,8 @@ def _print_summary(summary: dict[str, Any]) -> None:
 
     print(render(summary))
     print(f"{summary['ticks_per_s']:.0f} ticks/s, {summary['run_s']:.1f} s wall clock")
-    print(f"recording  {summary['recording']}")
     if summary["plot"]:
-        print(f"plot       {summary['plot']}")
+        print(f"plot {summary['plot']}")
 
 
 def _print_deployment(table: dict[str, Any], deployment: Deployment) -> None:

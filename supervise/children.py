@@ -66,15 +66,21 @@ class Process(Handle):
         environment = dict(os.environ)
         environment["OPENBLAS_NUM_THREADS"] = "1"
         environment["PYTHONUNBUFFERED"] = "1"
-        self._popen = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=log,
-            cwd=PYTHON_ROOT,
-            env=environment,
-            start_new_session=True,  # Ctrl-C is for the launcher, which ends the others in order
-        )
+        # SIGINT waits, blocked, until the child has its handler (wire.child): no half-loaded module
+        # is interrupted.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._popen = subprocess.Popen(
+                [sys.executable, "-m", module, *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                cwd=PYTHON_ROOT,
+                env=environment,
+                start_new_session=True,  # Ctrl-C is for the launcher alone
+            )
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         super().__init__(name, self._popen.pid, os.getpid())
         if self._popen.stdin is None or self._popen.stdout is None:
             raise RuntimeError("a pipe to a child is missing")

@@ -28,6 +28,8 @@ HIGHEST_FREE_PORT = 32_768
 LOWEST_PORT = 1024
 PREFIX = "octarm-"
 STALE_AFTER_S = 60.0
+SPECIAL = "?#;,"
+"""Characters that have a meaning in a Zenoh endpoint."""
 
 
 @dataclass
@@ -84,7 +86,8 @@ def _longest(directory: Path, nodes: int) -> int:
 
 def _own_directory(nodes: int) -> Endpoints:
     base = Path(tempfile.gettempdir())
-    if _longest(base / (PREFIX + "xxxxxxxx"), nodes) > LONGEST_SOCKET_PATH:
+    too_long = _longest(base / (PREFIX + "xxxxxxxx"), nodes) > LONGEST_SOCKET_PATH
+    if too_long or any(character in str(base) for character in SPECIAL):
         base = Path("/tmp")
     _sweep(base)
     directory = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base))  # mode 0700
@@ -125,6 +128,11 @@ def _given_directory(nodes: int, directory: Path) -> Endpoints:
         raise UsageError(
             f"--socket-dir {directory}: too long, a socket's path has at most "
             f"{LONGEST_SOCKET_PATH} bytes; give a shorter one or leave it out"
+        )
+    if any(character in str(directory) for character in SPECIAL):
+        raise UsageError(
+            f"--socket-dir {directory}: a socket's path may not contain any of {SPECIAL!r}; give "
+            "another or leave it out"
         )
     created = not directory.exists()
     try:

@@ -49,7 +49,10 @@ def execute(options: RunOptions, *, quiet: bool, plot: bool) -> Result:
                 _remove_if_empty(directory, made)
                 raise
             result = Result(outcome, directory, directory / RECORDING)
-            _conclude(result, view, plot)
+            if outcome.run_s > 0.0:
+                _conclude(result, view, plot)
+            else:
+                _remove_if_empty(directory, made)
     finally:
         endpoints.close()
     return result
@@ -90,7 +93,8 @@ def _make_directory(out: Path | None, run_id: str) -> tuple[Path, bool]:
 def _remove_if_empty(directory: Path, made: bool) -> None:
     """Leave no empty directory behind a run that never began; keep what explains why."""
     for file in directory.iterdir():
-        if file.name == RECORDING or (file == log_of(directory) and file.stat().st_size == 0):
+        empty_log = file == log_of(directory) and file.stat().st_size == 0
+        if file.name == RECORDING or file.match("node-*.json") or empty_log:
             file.unlink()
     if made and not any(directory.iterdir()):
         directory.rmdir()

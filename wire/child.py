@@ -52,6 +52,10 @@ def send_status(fd: int, name: str, event: str, **fields: Any) -> None:
         return
 
 
+ORPHAN_S = 8
+"""A child that finds the launcher dead ends within so many seconds."""
+
+
 class Child:
     """What the main thread of a node, plant or recorder waits on: lifeline, signals, wake-ups,
     time.
@@ -80,6 +84,7 @@ class Child:
             signal.signal(number, self._on_signal)
         signal.signal(signal.SIGPIPE, signal.SIG_IGN)
         signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # the launcher blocked it
         self.watch(reads_control=reads_control)
 
     def watch(self, *, reads_control: bool) -> None:
@@ -128,6 +133,7 @@ class Child:
 
     def _lost(self) -> None:
         self._poll.unregister(self._control)
+        signal.alarm(ORPHAN_S)  # whatever the end may hang on
         self.orphaned = True
         self.stopping = True
 

@@ -129,6 +129,7 @@ def test_unusable_socket_directory(start: Start, tmp_path: Path) -> None:
     file.touch()
     refused(start.run("--socket-dir", file), 2, "not a directory")
     refused(start.run("--socket-dir", tmp_path / ("long" * 40)), 2, "too long")
+    refused(start.run("--socket-dir", "what?"), 2, "may not contain")
 
 
 def test_socket_directory_of_a_running_run(start: Start, tmp_path: Path) -> None:

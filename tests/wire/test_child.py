@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from threading import Thread
 
 import pytest
 
-from wire.child import LINE_LIMIT, Child, Deadline, remove_sockets
+from wire.child import LINE_LIMIT, ORPHAN_S, Child, Deadline, remove_sockets
 
 
 @dataclass
@@ -62,6 +63,7 @@ def test_the_end_of_the_lifeline_is_noticed(pipes: Pipes, tmp_path: Path) -> Non
     assert pipes.child.stopping
     pipes.child.leave([])
     assert not tmp_path.exists()
+    assert 0 < signal.alarm(0) <= ORPHAN_S
 
 
 def test_a_wake_up_from_another_thread_ends_the_wait(pipes: Pipes) -> None:
