@@ -76,7 +76,10 @@ class RecorderProcess:
         """Record until the launcher says finish (or is gone); returns the exit code."""
         config = self._config
         self._writer.head(config.metadata, config.attachments)
-        session = zsession.open_session("client", (), config.links.connect)
+        session = zsession.open_client(config.links.connect, self._given_up)
+        if session is None:
+            self._close()
+            return ExitCode.OK
         try:
             keys = Keys(self._run)
             handler = zsession.queue(CAPACITY)
@@ -108,6 +111,11 @@ class RecorderProcess:
             session.close()
             self._close()
         return ExitCode.OK
+
+    def _given_up(self) -> bool:
+        """Whether the end was asked for while the plant was not there yet."""
+        self._child.wait(0.0)
+        return self._child.stopping
 
     def _drain(self, samples: Any) -> None:
         began = monotonic()

@@ -54,8 +54,8 @@ class RunOptions:
 
     gains: Path = DEFAULT_GAINS
     nodes: int = 10
-    ticks: int = 1200
-    tick_s: float = 0.05
+    ticks: int = 600
+    tick_s: float = 0.1
     seed: int = 1
     setpoint: str = "1"
     initial: str = "chapter"

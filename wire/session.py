@@ -12,7 +12,6 @@ import ctypes
 import json
 import os
 from collections.abc import Callable, Sequence
-from importlib import metadata
 from threading import get_ident
 from typing import Any
 
@@ -36,6 +35,8 @@ LEASE_MS = 10_000
 and in lock-step the tick deadline is shorter; a loaded machine must not lose a link for a late
 keep-alive."""
 
+CLIENT_OPEN_MS = 250
+
 
 def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> dict[str, Any]:
     return {
@@ -43,8 +44,9 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> dict[st
         "listen": {"endpoints": list(listen), "exit_on_failure": True},
         "connect": {
             "endpoints": list(connect),
-            "timeout_ms": -1,
-            "exit_on_failure": False,
+            # A client's open waits for its router: in short pieces, so that signals are heard.
+            "timeout_ms": CLIENT_OPEN_MS if mode == "client" else -1,
+            "exit_on_failure": mode == "client",
             "retry": {"period_init_ms": 10, "period_max_ms": 50, "period_increase_factor": 1.5},
         },
         "open": {"return_conditions": {"connect_scouted": False, "declares": True}},
@@ -101,6 +103,16 @@ def open_session(mode: str, listen: Sequence[str], connect: Sequence[str]) -> An
     os.environ["ZENOH_RUNTIME"] = RUNTIME_PLANT if mode == "router" else RUNTIME_NODE
     text = json.dumps(_config(mode, listen, connect))
     return zenoh.open(zenoh.Config.from_json5(text))
+
+
+def open_client(connect: Sequence[str], give_up: Callable[[], bool]) -> Any | None:
+    """Open a client's session as soon as its router is there; None if `give_up` says so before."""
+    while not give_up():
+        try:
+            return open_session("client", (), connect)
+        except zenoh.ZError:
+            continue  # not there yet; the attempt itself took CLIENT_OPEN_MS
+    return None
 
 
 def direct(function: Callable[[bytes], None]) -> Any:
@@ -161,8 +173,3 @@ def matched(publisher: Any) -> bool:
 def is_put(sample: Any) -> bool:
     """Whether a liveliness sample says that a token appeared (else it vanished)."""
     return bool(sample.kind == zenoh.SampleKind.PUT)
-
-
-def versions() -> dict[str, str]:
-    """Version of the Zenoh binding, for metadata and the doctor."""
-    return {"eclipse-zenoh": metadata.version("eclipse-zenoh")}

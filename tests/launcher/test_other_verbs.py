@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+import launcher
 from deploy import deploy
+from supervise.plan import RunOptions
 from wire.artefact import read_artefact
 
 Array = npt.NDArray[np.float64]
@@ -80,3 +83,12 @@ def test_help_names_verbs_and_options(start: Start) -> None:
     assert options.finish() == 0
     for option in ("--nodes", "--ticks", "--seed", "--json", "--socket-dir", "--no-plot"):
         assert option in options.out
+
+
+def test_the_command_line_has_the_defaults_of_the_options() -> None:
+    names = {"tick": "tick_s", "start_timeout": "start_timeout_s", "deadline": "deadline_s"}
+    own = {"json", "no_plot", "quiet", "no_pin"}
+    options = RunOptions()
+    for name, parameter in inspect.signature(launcher.run).parameters.items():
+        if name not in own:
+            assert parameter.default == getattr(options, names.get(name, name)), name
