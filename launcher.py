@@ -12,6 +12,7 @@ import signal
 import sys
 import tempfile
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
@@ -21,10 +22,13 @@ from wire.errors import ExitCode, OctarmError, UsageError
 
 if TYPE_CHECKING:
     from deploy import Deployment
+    from wire.artefact import Certificate
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 Ints = Annotated[tuple[int, ...], tyro.conf.UseAppendAction]
-DEFAULT_GAINS = Path(__file__).resolve().parent / "examples" / "default.gains.json"
+EXAMPLES = Path(__file__).resolve().parent / "examples"
+DEFAULT_GAINS = EXAMPLES / "default.gains.json"
+DEFAULT_ARM = EXAMPLES / "chapter_arm.toml"
 
 
 def run(
@@ -122,6 +126,58 @@ def run(
     return int(outcome.exit_code)
 
 
+def design(
+    *,
+    arm: Path = DEFAULT_ARM,
+    out: Path,
+    solver: str = "CLARABEL",
+    time_limit: float = 300.0,
+    force: Flag = False,
+    json: Flag = False,
+    quiet: Flag = False,
+) -> int:
+    """Design observer and controller for every setpoint of an arm; leaves a gains artefact.
+
+    Args:
+        arm: Arm file (TOML): material, geometry, damping, setpoints, weights.
+        out: Gains artefact to write; nothing is written unless every gain is certified.
+        solver: Semidefinite solver, by its name in CVXPY.
+        time_limit: Seconds for one semidefinite program.
+        force: Write over an existing file.
+        json: Print one JSON object instead of the table.
+        quiet: No progress.
+    """
+    if out.exists() and not force:
+        raise UsageError(f"--out {out}: it exists already; give another name or --force")
+    if not time_limit > 0.0:
+        raise UsageError(f"--time-limit: expected a positive number of seconds, got {time_limit!r}")
+    from design.command import Options, run_design
+
+    silent = quiet or json
+    artefact, digest = run_design(
+        arm,
+        out,
+        Options(solver=solver, time_limit_s=time_limit),
+        lambda text: None if silent else print(text, file=sys.stderr, flush=True),
+    )
+    rows = [
+        {"setpoint": s.name, "role": role, **_gammas(getattr(s, f"{role}_certificate"))}
+        for s in artefact.setpoints
+        for role in ("observer", "controller")
+    ]
+    if json:
+        _print_json({"artefact": str(out), "sha256": digest, "gains": rows})
+    else:
+        print(f"{'setpoint':<12} {'gain':<11} {'certified':>10} {'achieved':>9} {'open loop':>10}")
+        for row in rows:
+            print(
+                f"{row['setpoint']:<12} {row['role']:<11} {row['certified_gamma']:>10.4f} "
+                f"{row['achieved_gamma']:>9.4f} {row['open_loop_gamma']:>10.4f}"
+            )
+        print(f"{out}, SHA-256 {digest[:16]}")
+    return int(ExitCode.OK)
+
+
 def deploy(
     *,
     gains: Path = DEFAULT_GAINS,
@@ -184,14 +240,19 @@ def doctor(*, json: Flag = False) -> int:
     return int(ExitCode.OK if well else ExitCode.INTERNAL)
 
 
-VERBS = {"run": run, "deploy": deploy, "doctor": doctor}
+VERBS: dict[str, Callable[..., int]] = {
+    "run": run,
+    "design": design,
+    "deploy": deploy,
+    "doctor": doctor,
+}
 
 
 def main() -> NoReturn:
     """Entry point, see `octarm --help`."""
     signal.signal(signal.SIGTERM, _interrupt)
     try:
-        code = tyro.extras.subcommand_cli_from_dict(
+        code: int = tyro.extras.subcommand_cli_from_dict(
             VERBS, prog="octarm", description="A soft arm, one process a segment."
         )
     except OctarmError as error:
@@ -237,6 +298,11 @@ def _print_summary(summary: dict[str, Any]) -> None:
     print(f"{summary['ticks_per_s']:.0f} ticks/s, {summary['run_s']:.1f} s wall clock")
     if summary["plot"]:
         print(f"plot {summary['plot']}")
+
+
+def _gammas(certificate: Certificate) -> dict[str, Any]:
+    names = ("certified_gamma", "achieved_gamma", "open_loop_gamma", "optimum_gamma")
+    return {name: getattr(certificate, name) for name in (*names, "decay_per_s", "seconds")}
 
 
 def _print_deployment(table: dict[str, Any], deployment: Deployment) -> None:

@@ -151,6 +151,16 @@ def test_nothing_is_written_over(start: Start, tmp_path: Path) -> None:
     refused(start("deploy", "--gains", start.gains, "--out", full / "recording.mcap"), 2, "exists")
 
 
+def test_design_writes_nothing_over_and_names_a_missing_arm(start: Start, tmp_path: Path) -> None:
+    out = tmp_path / "gains.json"
+    refused(start("design", "--arm", tmp_path / "none.toml", "--out", out), 2, "none.toml")
+    assert not out.exists()
+    out.write_text("mine")
+    refused(start("design", "--out", out), 2, "exists already")
+    assert out.read_text() == "mine"
+    refused(start("design", "--out", tmp_path / "b", "--time-limit", "0"), 2, "--time-limit")
+
+
 def test_no_verb_and_unknown_verb(start: Start) -> None:
     for arguments, word in (([], "run"), (["fly"], "fly")):
         cli = start(*arguments)
