@@ -92,7 +92,7 @@ def multiply(left: Array, right: Array) -> Array:
     nodes, _, transform = projection(size)
     a = left @ basis(nodes, left.shape[2]).T
     b = right @ basis(nodes, right.shape[2]).T
-    return np.einsum("mka,kna,pa->mnp", a, b, transform, optimize=True)
+    return np.asarray(np.einsum("mka,kna,pa->mnp", a, b, transform, optimize=True))
 
 
 def to_plain(coefficients: Array) -> Array:
@@ -107,11 +107,15 @@ def from_plain(coefficients: npt.ArrayLike) -> Array:
 
 
 def trim(coefficients: Array, axes: tuple[int, ...], tolerance: float = 0.0) -> Array:
-    """Drop trailing coefficients along `axes` that are all at most `tolerance` in magnitude."""
+    """Drop trailing coefficients along `axes` that are all at most `tolerance` in magnitude.
+
+    At least one coefficient stays. Non-finite coefficients are never dropped.
+    """
     out = coefficients
     for axis in axes:
         moved = np.moveaxis(np.abs(out), axis, 0).reshape(out.shape[axis], -1)
-        present = np.nonzero(moved.max(axis=1, initial=0.0) > tolerance)[0]
+        largest = moved.max(axis=1, initial=0.0)
+        present = np.flatnonzero(~((largest <= tolerance) & np.isfinite(largest)))
         keep = int(present[-1]) + 1 if present.size else 1
         out = np.take(out, np.arange(keep), axis=axis)
     return out

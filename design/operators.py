@@ -98,6 +98,7 @@ class PIOperator:
         """Without the trailing coefficients below rounding (relative to the largest parameter)."""
         arrays = {k: getattr(self, k) for k in ("q1", "q2", "r0", "r1", "r2")}
         level = tolerance * max(float(np.abs(a).max(initial=0.0)) for a in arrays.values())
+        level = level if np.isfinite(level) else 0.0
         return PIOperator(
             p=self.p,
             **{k: legendre.trim(a, tuple(range(2, a.ndim)), level) for k, a in arrays.items()},
@@ -221,7 +222,7 @@ def vertical(*operators: PIOperator) -> PIOperator:
     into = operators[0].shape_in
     if any(a.shape_in != into for a in operators):
         raise ValueError(
-            f"cannot stack PI operators with domains {[a.shape_in for a in operators]}"
+            f"cannot stack PI operators: their domains differ, {[a.shape_in for a in operators]}"
         )
     return PIOperator(
         p=np.concatenate([a.p for a in operators]),
@@ -234,6 +235,12 @@ def vertical(*operators: PIOperator) -> PIOperator:
 
 def horizontal(*operators: PIOperator) -> PIOperator:
     """Put side by side: [A, B, ...]; all must have the same range."""
+    out = operators[0].shape_out
+    if any(a.shape_out != out for a in operators):
+        raise ValueError(
+            "cannot put PI operators side by side: their ranges differ, "
+            f"{[a.shape_out for a in operators]}"
+        )
     return vertical(*(a.adjoint for a in operators)).adjoint
 
 
@@ -276,8 +283,6 @@ def compose(a: PIOperator, b: PIOperator) -> PIOperator:
 
 def _kernels_on_column(a: PIOperator, column: Array) -> Array:
     """int_0^s A1(s,t) g(t) dt + int_s^1 A2(s,t) g(t) dt for g of shape (n, m, d)."""
-    kernel = PIOperator.zeros(Shape(0, a.r0.shape[0]), Shape(0, a.r0.shape[1]))
-    kernel = kernel.replace(r1=a.r1, r2=a.r2)
     y = _contract_with_primitive(_padded_sum(a.r1, -a.r2), column.shape[2], b_side=False)
     through = np.einsum("qnik,nmk->qmi", y, column)
     return _padded_sum(through, _contract_degree(a.r2, column))
@@ -290,13 +295,15 @@ def _row_through_kernels(row: Array, b: PIOperator) -> Array:
 
 def _contract_degree(kernel: Array, column: Array) -> Array:
     size = min(kernel.shape[3], column.shape[2])
-    return np.einsum("qnik,nmk->qmi", kernel[..., :size], column[..., :size])
+    return np.asarray(np.einsum("qnik,nmk->qmi", kernel[..., :size], column[..., :size]))
 
 
 def _kernel_product(left: Array, right: Array) -> Array:
     """int_0^1 left(s, r) right(r, t) dr: contraction over the basis of r."""
     size = min(left.shape[3], right.shape[2])
-    return np.einsum("qkij,knjl->qnil", left[..., :size], right[:, :, :size], optimize=True)
+    return np.asarray(
+        np.einsum("qkij,knjl->qnil", left[..., :size], right[:, :, :size], optimize=True)
+    )
 
 
 def _contract_with_primitive(kernel: Array, other: int, *, b_side: bool) -> Array:
@@ -310,7 +317,7 @@ def _contract_with_primitive(kernel: Array, other: int, *, b_side: bool) -> Arra
     primitive = legendre.antiderivative_of_products(inner, other, inner + other)
     f = primitive @ legendre.basis(nodes, inner + other).T
     values = np.einsum("qnij,ai->qnja", kernel, legendre.basis(nodes, outer))
-    return np.einsum("qnja,jka,pa->qnpk", values, f, transform, optimize=True)
+    return np.asarray(np.einsum("qnja,jka,pa->qnpk", values, f, transform, optimize=True))
 
 
 def _left_multiply(multiplier: Array, kernel: Array) -> Array:
@@ -318,7 +325,7 @@ def _left_multiply(multiplier: Array, kernel: Array) -> Array:
     nodes, _, transform = legendre.projection(size)
     m = multiplier @ legendre.basis(nodes, multiplier.shape[2]).T
     k = np.einsum("knij,ai->knaj", kernel, legendre.basis(nodes, kernel.shape[2]))
-    return np.einsum("qka,knaj,pa->qnpj", m, k, transform, optimize=True)
+    return np.asarray(np.einsum("qka,knaj,pa->qnpj", m, k, transform, optimize=True))
 
 
 def _right_multiply(kernel: Array, multiplier: Array) -> Array:
@@ -329,7 +336,7 @@ def _right_multiply(kernel: Array, multiplier: Array) -> Array:
 
 def _inner(row: Array, column: Array) -> Array:
     size = min(row.shape[2], column.shape[2])
-    return np.einsum("pnd,nmd->pm", row[..., :size], column[..., :size])
+    return np.asarray(np.einsum("pnd,nmd->pm", row[..., :size], column[..., :size]))
 
 
 def _resize(coefficients: Array, size: int) -> Array:
@@ -354,4 +361,4 @@ def _padded_sum(a: Array, b: Array) -> Array:
 
 
 def _sum_all(*arrays: Array) -> Array:
-    return np.sum(_common(arrays), axis=0)
+    return np.asarray(np.sum(_common(arrays), axis=0))

@@ -11,14 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import Polynomial
+from numpy.polynomial.legendre import legder, legval
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from design import legendre
 from design.legendre import Array
 
-FIT_SIZE = 32
-"""Legendre functions for smooth quantities that are not polynomials (sines, the holding load)."""
+FIT_SIZES = (32, 64, 128, 256)
+"""Numbers of Legendre functions to try for the holding load, which is smooth but no polynomial."""
+RESOLVED = 1e-8
+"""The load's last coefficients are to be below this part of its largest one."""
+ARC_NODES = 200
+"""Gauss points along a graph that is turned into a setpoint."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +47,10 @@ class Setpoint:
         """
         nodes, _ = legendre.gauss(64)
         theta = legendre.basis(nodes, self.angle.size) @ self.angle
-        return tuple(legendre.fit(f(theta))[: degree + 1] for f in (np.cos, np.sin))  # type: ignore[return-value]
+        keep = degree + 1
+        return legendre.fit(np.cos(theta))[:keep], legendre.fit(np.sin(theta))[:keep]
 
-    def frame_degree(self, tolerance: float = 1e-3, most: int = 5) -> int:
+    def frame_degree(self, tolerance: float = 2e-3, most: int = 5) -> int:
         """The smallest degree whose frame is within `tolerance` of the true one in L2, at the most `most`."""
         for degree in range(most):
             if self.frame_error(degree) <= tolerance:
@@ -63,32 +69,39 @@ def equilibrium_load(setpoint: Setpoint, axial_stiffness: float) -> tuple[Array,
     """Holding load f_e = -N_y' and axial strain e_e, coefficients in the orthonormal basis (theory, 5).
 
     The load is transverse only, so N = (0, N_y) with N_y = -theta''/((1 + e) cos theta) and
-    axial_stiffness e = N_y sin theta (EI = L = 1). Raises ValueError where the arm would have to point
-    along the load (cos theta <= 0), which no transverse load can hold.
+    axial_stiffness e = N_y sin theta (EI = L = 1). Raises ValueError if the arm turns by 90 degrees or
+    more, so that it would have to point along the load, or is too soft along its axis.
     """
-    nodes, _ = legendre.gauss(FIT_SIZE)
-    kappa, angle = setpoint.curvature, setpoint.angle
-    theta = legendre.basis(nodes, angle.size) @ angle
-    if np.any(np.cos(theta) <= 0.0):
+    angle = setpoint.angle
+    turn = float(np.max(np.abs(legendre.basis(np.linspace(0.0, 1.0, 257), angle.size) @ angle)))
+    if turn >= 0.5 * np.pi:
         raise ValueError(
-            f"setpoint {setpoint.name}: the arm turns by {np.degrees(np.max(np.abs(theta))):.1f} degrees; "
+            f"setpoint {setpoint.name}: the arm turns by {np.degrees(turn):.1f} degrees; "
             "a transverse load can hold less than 90"
         )
-    rate = np.polynomial.legendre.legval(
-        2.0 * nodes - 1.0,
-        2.0 * np.polynomial.legendre.legder(legendre.to_plain(np.append(kappa, 0.0))),
-    )
-    strain = np.zeros_like(nodes)
-    force = np.zeros_like(nodes)
-    for _ in range(50):  # a contraction: the strain is of the order of 1 / axial_stiffness
-        force = -rate / ((1.0 + strain) * np.cos(theta))
-        new = force * np.sin(theta) / axial_stiffness
-        if np.max(np.abs(new - strain)) < 1e-16:
+    for size in FIT_SIZES:
+        force, strain = _balance(setpoint, axial_stiffness, size)
+        load = -2.0 * legder(legendre.to_plain(force))
+        if np.max(np.abs(load[-2:])) <= RESOLVED * np.max(np.abs(load)):
             break
-        strain = new
-    series = legendre.to_plain(legendre.fit(force))
-    load = -2.0 * np.polynomial.legendre.legder(series)
-    return legendre.from_plain(load), legendre.fit(strain)
+    return legendre.from_plain(load), strain
+
+
+def _balance(setpoint: Setpoint, axial_stiffness: float, size: int) -> tuple[Array, Array]:
+    """N_y and the axial strain in `size` basis functions, from the two static balances."""
+    nodes, _ = legendre.gauss(size)
+    theta = legendre.basis(nodes, setpoint.angle.size) @ setpoint.angle
+    kappa = legendre.to_plain(np.append(setpoint.curvature, 0.0))
+    rate = legval(2.0 * nodes - 1.0, 2.0 * legder(kappa))
+    # e (1 + e) = -theta'' tan(theta) / axial_stiffness, on the branch that starts at e = 0
+    discriminant = 1.0 - 4.0 * rate * np.tan(theta) / axial_stiffness
+    if np.any(discriminant <= 0.0):
+        raise ValueError(
+            f"setpoint {setpoint.name}: no transverse load holds this shape with axial stiffness "
+            f"{axial_stiffness:g}, the arm would be compressed by half; use a stiffer arm or bend less"
+        )
+    strain = 0.5 * (np.sqrt(discriminant) - 1.0)
+    return legendre.fit(-rate / ((1.0 + strain) * np.cos(theta))), legendre.fit(strain)
 
 
 def tip_position(setpoint: Setpoint, strain: Array) -> Array:
@@ -102,27 +115,37 @@ def tip_position(setpoint: Setpoint, strain: Array) -> Array:
 def from_shape(name: str, shape: Sequence[float], degree: int = 4) -> Setpoint:
     """Setpoint from a graph w_e(x) = sum shape[j] x^j of arc length 1 (the chapter's Fig. 2).
 
-    The graph is cut where its ARCLENGTH reaches 1 (theory, section 1, erratum 'Fig. 2'); its curvature is
-    fitted by (1 - s)^2 times a polynomial, of total degree `degree`, in least squares over s.
-    Raises ValueError if w_e does not leave the root straight (w_e(0) = w_e'(0) = 0).
+    The graph is cut where its ARCLENGTH reaches 1 (theory, section 1, erratum 'Fig. 2'). The curvature is
+    (1 - s)^2 times a polynomial, of total degree `degree`, such that its integral fits the graph's ANGLE
+    in least squares over s: the angle places the tip, and a curvature that no arm can have at the root
+    (setpoint 3) does not spoil the rest.
+    Raises ValueError if w_e does not leave the root straight (w_e(0) = w_e'(0) = 0) or `degree` < 2.
     """
+    if degree < 2:
+        raise ValueError(
+            f"setpoint {name}: curvature of degree {degree}; at least 2 is needed to vanish twice at the tip"
+        )
     w = Polynomial(np.asarray(shape, dtype=np.float64))
-    slope, bend = w.deriv(), w.deriv(2)
+    slope = w.deriv()
     if abs(w(0.0)) > 0.0 or abs(slope(0.0)) > 0.0:
         raise ValueError(f"setpoint {name}: w_e(0) and w_e'(0) must be zero (clamped root)")
 
     def length(x: float) -> float:
         return float(quad(lambda t: np.hypot(1.0, slope(t)), 0.0, x, epsabs=1e-12)[0])
 
-    x_tip = float(brentq(lambda x: length(x) - 1.0, 1e-6, 1.0))
-    x = np.linspace(0.0, x_tip, 4001)
-    ds = np.hypot(1.0, slope(x))
-    s = np.concatenate([[0.0], np.cumsum(0.5 * (ds[1:] + ds[:-1]) * np.diff(x))])
-    kappa = bend(x) / ds**3
-    powers = np.arange(degree - 1)
-    matrix = (1.0 - s)[:, None] ** 2 * s[:, None] ** powers
-    solution = np.linalg.lstsq(matrix, kappa, rcond=None)[0]
-    fitted = Polynomial([1.0, -2.0, 1.0]) * Polynomial(solution)
+    x_tip = float(brentq(lambda x: length(x) - 1.0, 1e-6, 1.0 + 1e-9))
+    points, weights = legendre.gauss(ARC_NODES)
+    ds = x_tip * np.hypot(1.0, slope(x_tip * points))
+    primitive = legendre.fit(ds) @ legendre.integration(ARC_NODES, ARC_NODES + 1)
+    s = legendre.basis(points, ARC_NODES + 1) @ primitive
+    angle = np.arctan(slope(x_tip * points))
+    vanishing = Polynomial([1.0, -2.0, 1.0])  # (1 - s)^2
+    columns = [(vanishing * Polynomial.basis(j)).integ()(s) for j in range(degree - 1)]
+    root = np.sqrt(weights * ds)
+    solution = np.linalg.lstsq(root[:, None] * np.stack(columns, axis=1), root * angle, rcond=None)[
+        0
+    ]
+    fitted = vanishing * Polynomial(solution)
     nodes, _ = legendre.gauss(degree + 1)
     return Setpoint(name=name, curvature=legendre.fit(fitted(nodes)))
 
