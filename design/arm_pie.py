@@ -99,16 +99,19 @@ def arm_pie(cosine: Array, sine: Array, alpha: float, drag: float) -> ArmPIE:
 
 
 def functional(*states: str) -> PIOperator:
-    """x -> (int_0^1 x_i ds) for the named states: R^len(states) from 4 functions."""
-    q1 = np.zeros((len(states), 4, 1))
-    for row, name in enumerate(states):
-        q1[row, STATES.index(name), 0] = 1.0
+    """x -> (int_0^1 x_i ds) for the named states: R^len(states) from 4 functions; see `STATES`."""
+    q1 = _picked(states)[:, :, None]
     return PIOperator.zeros(Shape(len(states), 0), Shape(0, 4)).replace(q1=q1)
 
 
 def selection(*states: str) -> PIOperator:
-    """x -> the named states as functions."""
-    r0 = np.zeros((len(states), 4, 1))
-    for row, name in enumerate(states):
-        r0[row, STATES.index(name), 0] = 1.0
-    return PIOperator.multiplier(r0)
+    """x -> the named states as functions; see `STATES`."""
+    return PIOperator.multiplier(_picked(states)[:, :, None])
+
+
+def _picked(states: tuple[str, ...]) -> Array:
+    """Rows of the identity; ValueError if a name is unknown."""
+    for name in states:
+        if name not in STATES:
+            raise ValueError(f"unknown state {name!r}; expected one of {STATES}")
+    return np.eye(4)[[STATES.index(name) for name in states]]
