@@ -35,7 +35,7 @@ def run(
     *,
     gains: Path = DEFAULT_GAINS,
     nodes: int = 10,
-    ticks: int = 600,
+    ticks: int = 1200,
     tick: float = 0.1,
     seed: int = 1,
     setpoint: str = "1",

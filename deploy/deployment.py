@@ -18,6 +18,7 @@ import numpy.typing as npt
 from numpy.polynomial import legendre
 
 from deploy.arm import ArmModes, make_arm_modes
+from deploy.feedforward import holding_commands
 from deploy.grid import Place, SegmentGrid, make_grid
 from deploy.semiseparable import NodeMatrices, multiply, realise
 from deploy.stability import SpectralRadius, longest_stable_tick, spectral_radius
@@ -184,11 +185,11 @@ def _offsets(setpoint: Setpoint, grid: SegmentGrid) -> tuple[Array, Array]:
     for column, place, series in (
         (2, Place.CENTRE, setpoint.strain),
         (3, Place.INNER_FACE, setpoint.curvature_per_m),
-        (4, Place.OUTER_FACE, setpoint.feedforward_n_per_m),
         (6, Place.INNER_FACE, setpoint.curvature_per_m),
     ):
         scaled = 2.0 * grid.locations_m(place) / grid.length_m - 1.0
         in_offset[:, column] = legendre.legval(scaled, np.asarray(series, dtype=np.float64))
+    in_offset[:, 4] = holding_commands(setpoint.feedforward_n_per_m, grid)
     return in_offset, in_offset[:, :OUTPUTS].copy()
 
 

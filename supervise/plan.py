@@ -54,7 +54,7 @@ class RunOptions:
 
     gains: Path = DEFAULT_GAINS
     nodes: int = 10
-    ticks: int = 600
+    ticks: int = 1200
     tick_s: float = 0.1
     seed: int = 1
     setpoint: str = "1"

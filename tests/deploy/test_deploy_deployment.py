@@ -11,6 +11,8 @@ from deploy_artefacts import ARM, CURVED, STRAIGHT, gains, make_artefact
 from numpy.polynomial import legendre
 
 from deploy import Deployment, deploy
+from deploy.feedforward import holding_commands
+from deploy.grid import make_grid
 from node.sweep import NodeSweep
 from wire.errors import UsageError
 
@@ -81,15 +83,17 @@ def test_offsets_are_the_setpoint_where_each_node_holds_it() -> None:
     faces = [0.0, 0.3, 0.45, 0.9, 1.25]
     deployment = deploy(artefact, 4, TICK, faces)
     np.testing.assert_array_equal(deployment.faces_m, faces)
+    grid = make_grid(ARM.length_m, 4, faces)
     for i, node in enumerate(deployment.nodes):
         inner, outer = faces[i], faces[i + 1]
         for setpoint, factors in zip(artefact.setpoints, node.setpoints, strict=True):
-            strain, curvature, force = (
+            # the commands are a projection of the load, tested in test_feedforward.py
+            force = float(holding_commands(setpoint.feedforward_n_per_m, grid)[i])
+            strain, curvature = (
                 float(legendre.legval(2.0 * s / ARM.length_m - 1.0, np.array(series)))
                 for s, series in (
                     (0.5 * (inner + outer), setpoint.strain),
                     (inner, setpoint.curvature_per_m),
-                    (outer, setpoint.feedforward_n_per_m),
                 )
             )
             expected = [0.0, 0.0, strain, curvature, force, 0.0, curvature]
