@@ -129,7 +129,7 @@ def run(
 def design(
     *,
     arm: Path = DEFAULT_ARM,
-    out: Path,
+    out: Path | None = None,
     solver: str = "CLARABEL",
     time_limit: float = 300.0,
     force: Flag = False,
@@ -140,13 +140,15 @@ def design(
 
     Args:
         arm: Arm file (TOML): material, geometry, damping, setpoints, weights.
-        out: Gains artefact to write; nothing is written unless every gain is certified.
+        out: Gains artefact to write, default <name of the arm file>.gains.json in this folder; nothing
+            is written unless every gain is certified.
         solver: Semidefinite solver, by its name in CVXPY.
         time_limit: Seconds for one semidefinite program.
         force: Write over an existing file.
         json: Print one JSON object instead of the table.
         quiet: No progress.
     """
+    out = out or Path(f"{arm.stem}.gains.json")
     if out.exists() and not force:
         raise UsageError(f"--out {out}: it exists already; give another name or --force")
     if not time_limit > 0.0:
@@ -168,11 +170,16 @@ def design(
     if json:
         _print_json({"artefact": str(out), "sha256": digest, "gains": rows})
     else:
-        print(f"{'setpoint':<12} {'gain':<11} {'certified':>10} {'achieved':>9} {'open loop':>10}")
+        print(
+            f"{'setpoint':<10} {'gain':<11} {'certified':>9} {'achieved':>9} {'optimum':>8} "
+            f"{'open loop':>9} {'decay [1/s]':>11} {'gain norm':>9} {'seconds':>8}"
+        )
         for row in rows:
             print(
-                f"{row['setpoint']:<12} {row['role']:<11} {row['certified_gamma']:>10.4f} "
-                f"{row['achieved_gamma']:>9.4f} {row['open_loop_gamma']:>10.4f}"
+                f"{row['setpoint']:<10} {row['role']:<11} {row['certified_gamma']:>9.4f} "
+                f"{row['achieved_gamma']:>9.4f} {row['optimum_gamma']:>8.4f} "
+                f"{row['open_loop_gamma']:>9.4f} {row['decay_per_s']:>11.4f} "
+                f"{row['gain_norm']:>9.2f} {row['seconds']:>8.1f}"
             )
         print(f"{out}, SHA-256 {digest[:16]}")
     return int(ExitCode.OK)
@@ -302,7 +309,7 @@ def _print_summary(summary: dict[str, Any]) -> None:
 
 def _gammas(certificate: Certificate) -> dict[str, Any]:
     names = ("certified_gamma", "achieved_gamma", "open_loop_gamma", "optimum_gamma")
-    return {name: getattr(certificate, name) for name in (*names, "decay_per_s", "seconds")}
+    return {name: getattr(certificate, name) for name in (*names, "decay_per_s", "gain_norm", "seconds")}
 
 
 def _print_deployment(table: dict[str, Any], deployment: Deployment) -> None:
