@@ -7,6 +7,7 @@ refused unless certified; the artefact is written only when every gain is.
 from __future__ import annotations
 
 import importlib.metadata
+import os
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -77,15 +78,28 @@ def run_design(
 ) -> tuple[GainsArtefact, str]:
     """Design all setpoints of an arm file and write the artefact; returns it and its SHA-256 digest.
 
-    Raises UsageError for a bad arm file and GainsRefusedError, before anything is written, if a gain is
-    not certified; the message names setpoint, role and what failed.
+    Raises UsageError for a bad arm file, solver or output path, before the work starts, and
+    GainsRefusedError, before anything is written, if a gain is not certified; the message names setpoint,
+    role and what failed.
     """
     file = read_arm_file(arm_path)
+    _check_output(out_path)
     artefact = design_artefact(file, options or Options(), progress)
     try:
         return artefact, write_artefact(artefact, out_path)
     except OSError as error:
         raise UsageError(f"--out {out_path}: {error.strerror or error}") from None
+
+
+def _check_output(path: Path) -> None:
+    """UsageError, now and not after minutes of work, if nothing can be written there."""
+    existing = path.parent
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if path.is_dir():
+        raise UsageError(f"--out {path}: is a directory; give the name of a file")
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
+        raise UsageError(f"--out {path}: {existing} is no directory that can be written to")
 
 
 def design_artefact(

@@ -189,15 +189,21 @@ def _encode(artefact: GainsArtefact) -> bytes:
 
 
 def write_artefact(artefact: GainsArtefact, path: Path) -> str:
-    """Write the artefact atomically (a reader never sees half a file); returns its digest."""
+    """Write the artefact atomically (a reader never sees half a file); returns its digest.
+
+    Raises GainsRefusedError for an artefact that `read_artefact` would refuse, and OSError.
+    """
     check(artefact, "the artefact to be written")
     content = _encode(artefact)
     sha = hashlib.sha256(content).hexdigest()
     head = f'{{"format":"{FORMAT}","version":{VERSION},"sha256":"{sha}","content":'
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(head.encode() + content + b"}\n")
-    temporary.replace(path)
+    try:
+        temporary.write_bytes(head.encode() + content + b"}\n")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
     return sha
 
 
@@ -214,32 +220,40 @@ def read_artefact(path: Path) -> GainsArtefact:
             f"gains artefact {path}: {error.strerror or error}; make one with `octarm design` or give "
             "another with --gains"
         ) from None
+    return parse_artefact(raw, f"gains artefact {path}")
+
+
+def parse_artefact(raw: bytes, where: str) -> GainsArtefact:
+    """The artefact in the bytes of a gains file, e.g. one that is attached to a recording.
+
+    `where` begins every message. Raises GainsRefusedError as `read_artefact` does.
+    """
     remedy = "make it again with `octarm design`"
     try:
         file = msgspec.json.decode(raw, type=_File)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise GainsRefusedError(
-            f"gains artefact {path}: not a whole octarm gains file ({error}); {remedy}"
+            f"{where}: not a whole octarm gains file ({error}); {remedy}"
         ) from None
     if file.format != FORMAT:
         raise GainsRefusedError(
-            f"gains artefact {path}: expected format {FORMAT!r}, got {file.format!r}; {remedy}"
+            f"{where}: expected format {FORMAT!r}, got {file.format!r}; {remedy}"
         )
     if file.version != VERSION:
         raise GainsRefusedError(
-            f"gains artefact {path}: format version {file.version}, this octarm reads {VERSION}; {remedy}"
+            f"{where}: format version {file.version}, this octarm reads {VERSION}; {remedy}"
         )
     sha = hashlib.sha256(bytes(file.content)).hexdigest()
     if sha != file.sha256:
         raise GainsRefusedError(
-            f"gains artefact {path}: the content's SHA-256 is {sha[:16]}..., the file says "
+            f"{where}: the content's SHA-256 is {sha[:16]}..., the file says "
             f"{file.sha256[:16]}...: it was damaged or edited; {remedy}"
         )
     try:
         artefact = msgspec.json.decode(bytes(file.content), type=GainsArtefact)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise GainsRefusedError(f"gains artefact {path}: {error}; {remedy}") from None
-    check(artefact, f"gains artefact {path}")
+        raise GainsRefusedError(f"{where}: {error}; {remedy}") from None
+    check(artefact, where)
     return artefact
 
 
@@ -247,21 +261,31 @@ def check(artefact: GainsArtefact, where: str) -> None:
     """Refuse an artefact with wrong shapes, non-finite numbers or an uncertified gain."""
     if not artefact.setpoints:
         raise GainsRefusedError(f"{where}: no setpoint in it; at least one is needed")
+    names = [s.name for s in artefact.setpoints]
+    if len(set(names)) != len(names):
+        raise GainsRefusedError(f"{where}: setpoints: every name once, got {', '.join(names)}")
+    for key, weight in artefact.weights.items():
+        _finite(weight, f"{where}: weights[{key!r}]")
     for number, setpoint in enumerate(artefact.setpoints):
         place = f"{where}: setpoints[{number}] ({setpoint.name})"
         for key in ("curvature_per_m", "strain", "feedforward_n_per_m", "tip_m"):
             _finite(getattr(setpoint, key), f"{place}.{key}")
+            if not getattr(setpoint, key):
+                raise GainsRefusedError(f"{place}.{key}: expected at least one number, got none")
         if len(setpoint.tip_m) != 2:
             raise GainsRefusedError(f"{place}.tip_m: expected 2 numbers, got {len(setpoint.tip_m)}")
         _check_operator(setpoint.observer, 4, 2, f"{place}.observer")
         _check_operator(setpoint.controller, 1, 4, f"{place}.controller")
         for role in ("observer", "controller"):
-            outcome = getattr(setpoint, f"{role}_certificate").outcome
-            if outcome != "certified":
+            certificate: Certificate = getattr(setpoint, f"{role}_certificate")
+            if certificate.outcome != "certified":
                 raise GainsRefusedError(
-                    f"{place}.{role}: its certificate says {outcome!r}, only 'certified' gains are run; "
-                    "run `octarm design` with other weights"
+                    f"{place}.{role}: its certificate says {certificate.outcome!r}, only 'certified' gains "
+                    "are run; run `octarm design` with other weights"
                 )
+            for key, value in msgspec.structs.asdict(certificate).items():
+                if isinstance(value, float):
+                    _finite(value, f"{place}.{role}_certificate.{key}")
 
 
 def _check_operator(factors: OperatorFactors, outputs: int, inputs: int, place: str) -> None:
@@ -280,6 +304,8 @@ def _check_operator(factors: OperatorFactors, outputs: int, inputs: int, place: 
             got = matrix.array
         except ValueError:
             raise GainsRefusedError(f"{place}.{key}: ragged array of coefficients") from None
+        if rows == 0 and not matrix.coefficients:  # no terms; the file keeps no other dimension
+            continue
         if got.shape[:2] != (rows, columns) or got.shape[2] < 1:
             raise GainsRefusedError(
                 f"{place}.{key}: expected {rows} x {columns} polynomials, got shape {got.shape}"
