@@ -65,6 +65,7 @@ class RecorderProcess:
         self._rejections = Rejections()
         self._weights = np.asarray(run.energy_weights)
         self._last: tuple[int, dict[int, Row]] | None = None
+        self._first_energy: float | None = None
         self._told_at = 0.0
         self._written = 0
         self._silent: set[int] = set()
@@ -149,6 +150,8 @@ class RecorderProcess:
             self._tell(tick)
             self._writer.tick(tick, rows)
             self._last = (tick, rows)
+            if tick == 0:
+                self._first_energy = self._error_energy(rows)
             self._written = tick + 1
 
     def _tell(self, tick: float) -> None:
@@ -166,19 +169,24 @@ class RecorderProcess:
             return
         self._told_at = now
         tick, rows = self._last
+        energy = self._error_energy(rows)
+        if energy is None:
+            return
+        tip_error_m = rows[PLANT][4 * self._config.run.nodes + 2]
+        relative = math.sqrt(energy / self._first_energy) if self._first_energy else None
+        self._child.status(
+            "progress", tick=tick + 1, tip_error_m=tip_error_m, estimation_error=relative
+        )
+
+    def _error_energy(self, rows: dict[int, Row]) -> float | None:
+        """Energy in J of estimate less truth at one tick; None while a row is missing."""
         nodes = self._config.run.nodes
         plant = rows.get(PLANT)
         if plant is None or len(rows) <= nodes:
-            return
+            return None
         truth = np.asarray(plant[: 4 * nodes]).reshape(nodes, 4)
         estimate = np.asarray([rows[i][2:6] for i in range(nodes)])
-        energy = float(np.sum(self._weights * (estimate - truth) ** 2))
-        self._child.status(
-            "progress",
-            tick=tick + 1,
-            tip_error_m=plant[4 * nodes + 2],
-            estimation_error=math.sqrt(energy),
-        )
+        return float(np.sum(self._weights * (estimate - truth) ** 2))
 
     # -- the end ----------------------------------------------------------------------------------
 

@@ -46,10 +46,11 @@ class View:
         self._tick = tick
         self.draw(now)
 
-    def errors(self, tip_error_m: float, estimation_error: float) -> None:
-        """Latest figures: the tip's error, and the estimate's in the energy norm (J^(1/2))."""
-        tip = f"{tip_error_m * 1e3:.3g} mm"
-        self._figures = f"tip error {tip}, estimation error {estimation_error:.3g}"
+    def errors(self, tip_error_m: float, estimation_error: float | None) -> None:
+        """Latest figures: the tip's error, and the estimate's in the energy norm, share of the first."""
+        self._figures = f"tip error {tip_error_m * 1e3:.3g} mm"
+        if estimation_error is not None:
+            self._figures += f", estimation error {estimation_error:.2%}"
 
     def rate(self, now: float) -> float:
         """Ticks a second since the first report."""
