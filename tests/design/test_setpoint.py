@@ -158,9 +158,10 @@ def test_frame_is_the_l2_projection_of_cosine_and_sine(degree: int) -> None:
 
 def test_frame_degree_is_the_smallest_within_the_tolerance() -> None:
     setpoint = chapter("1")
-    for tolerance in (1e-1, 1e-2, 2e-3):
-        degree = setpoint.frame_degree(tolerance)
-        assert setpoint.frame_error(degree) <= tolerance < setpoint.frame_error(degree - 1)
+    for degree in (1, 2, 3):
+        error = setpoint.frame_error(degree)
+        assert setpoint.frame_degree(1.001 * error) == degree
+        assert setpoint.frame_degree(0.999 * error) == degree + 1
     assert setpoint.frame_degree(1e-15, most=3) == 3
     assert from_powers("straight", 0.0).frame_degree() == 0
 
