@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+import warnings
 from pathlib import Path
 
 import msgspec
 import numpy as np
+from scipy.integrate import IntegrationWarning
 
 from design import legendre
-from design.setpoint import Setpoint, from_shape
+from design.setpoint import Setpoint, equilibrium_load, from_shape
 from wire.artefact import Arm
 from wire.errors import UsageError
 
@@ -58,6 +60,15 @@ class SetpointEntry(_Section, frozen=True):
     shape: list[float] | None = None
     """w_e(x) / L = sum c[j] (x / L)^j, a graph in the plane, cut at arclength L (chapter, Fig. 2)."""
 
+    def nondimensional(self, length_m: float) -> Setpoint:
+        """Curvature times L as a function of s / L."""
+        if self.shape is not None:
+            return from_shape(self.name, self.shape)
+        series = np.asarray(self.curvature_per_m) * length_m
+        nodes, _ = legendre.gauss(series.size)
+        values = np.polynomial.polynomial.polyval(nodes, series)
+        return Setpoint(self.name, legendre.fit(values))
+
 
 class ArmFile(_Section, frozen=True):
     """A whole arm file."""
@@ -84,16 +95,7 @@ class ArmFile(_Section, frozen=True):
 
     def design_setpoints(self) -> list[Setpoint]:
         """The setpoints in nondimensional form; curvature times L as a function of s / L."""
-        out = []
-        for entry in self.setpoints:
-            if entry.shape is not None:
-                out.append(from_shape(entry.name, entry.shape))
-                continue
-            series = np.asarray(entry.curvature_per_m) * self.geometry.length_m
-            nodes, _ = legendre.gauss(series.size)
-            values = np.polynomial.polynomial.polyval(nodes, series)
-            out.append(Setpoint(entry.name, legendre.fit(values)))
-        return out
+        return [entry.nondimensional(self.geometry.length_m) for entry in self.setpoints]
 
 
 def time_unit_s(arm: Arm) -> float:
@@ -117,7 +119,7 @@ def read_arm_file(path: Path) -> ArmFile:
         ) from None
     try:
         arm = msgspec.toml.decode(raw, type=ArmFile)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, OverflowError, RecursionError) as error:
         raise UsageError(f"arm file {path}: {error}{_unit_hint(str(error))}") from None
     check_arm_file(arm, str(path))
     return arm
@@ -149,6 +151,15 @@ def check_arm_file(arm: ArmFile, where: str) -> None:
             f"arm file {where}: damping: expected exactly one of first_mode_damping_ratio and drag_per_s, "
             f"a positive number (an undamped arm has no certificate); got {given}"
         )
+    try:
+        units = [arm.arm().drag_per_s, time_unit_s(arm.arm())]
+    except (ValueError, OverflowError, ZeroDivisionError):
+        units = [math.nan]
+    if not all(math.isfinite(v) and v > 0.0 for v in units):
+        raise UsageError(
+            f"arm file {where}: material, geometry, damping: expected numbers of the size of an arm's in SI "
+            "units; masses, stiffnesses or times computed from these are zero or infinite"
+        )
     if not arm.setpoints:
         raise UsageError(
             f"arm file {where}: setpoints: expected at least one [[setpoints]] table, got none"
@@ -157,7 +168,10 @@ def check_arm_file(arm: ArmFile, where: str) -> None:
     if len(set(names)) != len(names):
         raise UsageError(f"arm file {where}: setpoints: every name once, got {', '.join(names)}")
     for number, entry in enumerate(arm.setpoints):
-        _check_setpoint(entry, f"arm file {where}: setpoints[{number}] ({entry.name})", arm)
+        place = f"arm file {where}: setpoints[{number}] ({entry.name})"
+        with np.errstate(over="ignore", invalid="ignore"):
+            _check_setpoint(entry, place, arm)
+        _check_equilibrium(entry, place, arm)
 
 
 def _check_setpoint(entry: SetpointEntry, where: str, arm: ArmFile) -> None:
@@ -168,6 +182,8 @@ def _check_setpoint(entry: SetpointEntry, where: str, arm: ArmFile) -> None:
         )
     if not given[0] or not all(math.isfinite(c) for c in given[0]):
         raise UsageError(f"{where}: expected finite polynomial coefficients, got {given[0]}")
+    if not entry.name:
+        raise UsageError(f"{where}.name: expected a name, got an empty one")
     if entry.shape is not None and any(entry.shape[:2]):
         raise UsageError(
             f"{where}.shape: the first two coefficients must be 0 (clamped root), got {entry.shape[:2]}"
@@ -179,17 +195,34 @@ def _check_setpoint(entry: SetpointEntry, where: str, arm: ArmFile) -> None:
             ("curvature", np.sum(series)),
             ("slope of the curvature", np.sum(series * np.arange(series.size))),
         ):
-            if abs(value) > 1e-9 * scale:
+            if not abs(value) <= 1e-9 * scale:
                 raise UsageError(
                     f"{where}.curvature_per_m: the {what} at the tip must be 0 (no moment, no shear at the "
                     f"free end), got {value:.3g}"
                 )
     limit = 1.0 / arm.geometry.radius_m
-    worst = max(abs(v) for v in curvature_samples(entry, arm.geometry.length_m))
-    if worst > limit:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", IntegrationWarning)
+            worst = float(np.max(np.abs(curvature_samples(entry, arm.geometry.length_m))))
+    except (ArithmeticError, RuntimeError, ValueError, Warning, np.linalg.LinAlgError):
+        raise UsageError(
+            f"{where}: expected the polynomial of an arm's shape, got {given[0]}, which cannot be followed "
+            "along the arm"
+        ) from None
+    if not worst <= limit:
         raise UsageError(
             f"{where}: curvature {worst:.1f}/m exceeds 1/radius = {limit:.1f}/m: the arm would overlap itself"
         )
+
+
+def _check_equilibrium(entry: SetpointEntry, where: str, arm: ArmFile) -> None:
+    """UsageError unless a transverse load can hold the setpoint (theory, section 5)."""
+    try:
+        setpoint = entry.nondimensional(arm.geometry.length_m)
+        equilibrium_load(setpoint, axial_ratio(arm.arm()) ** 2)
+    except ValueError as error:
+        raise UsageError(f"{where}: {error}") from None
 
 
 def curvature_samples(entry: SetpointEntry, length_m: float, count: int = 101) -> list[float]:
