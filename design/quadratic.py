@@ -143,7 +143,10 @@ def lifted(finite: PIOperator) -> PIOperator:
 
 
 def unit_rows(rows: PIOperator) -> PIOperator:
-    """Rows scaled to Hilbert-Schmidt norm one (multipliers by their L2 norm), to balance Gram matrices."""
+    """Rows scaled to about Hilbert-Schmidt norm one, to balance Gram matrices.
+
+    Multipliers count by their L2 norm, kernels by half their squares over the whole of [0, 1]^2.
+    """
     out = []
     for i in range(rows.shape_out.functions):
         row = rows.rows([], [i])
