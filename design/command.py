@@ -31,6 +31,7 @@ from design.hinf import (
     solve_hinf,
 )
 from design.inverse import solve_gain
+from design.semidefinite import solvers
 from design.setpoint import Setpoint, equilibrium_load, tip_position
 from design.verify import Achieved, verify_controller, verify_observer
 from wire.artefact import (
@@ -84,7 +85,13 @@ def run_design(
     """
     file = read_arm_file(arm_path)
     _check_output(out_path)
-    artefact = design_artefact(file, options or Options(), progress)
+    options = options or Options()
+    if options.solver not in solvers():
+        raise UsageError(
+            f"--solver {options.solver}: expected a semidefinite solver that is installed: "
+            f"{', '.join(solvers())}"
+        )
+    artefact = design_artefact(file, options, progress)
     try:
         return artefact, write_artefact(artefact, out_path)
     except OSError as error:

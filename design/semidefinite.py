@@ -21,6 +21,19 @@ ROW_FLOOR = 1e-5
 RANK_TOLERANCE = 1e-7
 """Singular values of the scaled equalities below this (relative) are dependent rows."""
 ACCEPTED = ("optimal", "optimal_inaccurate")
+TIME_LIMITS = {
+    "CLARABEL": "time_limit",
+    "SCS": "time_limit_secs",
+    "MOSEK": "",
+    "COPT": "",
+    "CVXOPT": "",
+}
+"""CVXPY's solvers of semidefinite programs, and the option that limits their time where there is one."""
+
+
+def solvers() -> tuple[str, ...]:
+    """The semidefinite solvers that are installed here."""
+    return tuple(name for name in TIME_LIMITS if name in cp.installed_solvers())
 
 
 @dataclass(frozen=True)
@@ -111,7 +124,8 @@ class Program:
         constraints += [grams[name] >> 0 for name, _ in self.layout.grams]
         constraints += [numbers[name] == value for name, value in fixed.items()]
         problem = cp.Problem(cp.Minimize(objective(numbers, free)), constraints)
-        options = {"time_limit": time_limit_s} if solver == "CLARABEL" else {}
+        limit = TIME_LIMITS.get(solver)
+        options = {limit: time_limit_s} if limit else {}
         start = time.perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # 'may be inaccurate': judged below
