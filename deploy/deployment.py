@@ -22,7 +22,7 @@ from deploy.feedforward import holding_commands
 from deploy.grid import Place, SegmentGrid, make_grid
 from deploy.semiseparable import NodeMatrices, multiply, realise
 from deploy.stability import SpectralRadius, longest_stable_tick, spectral_radius
-from deploy.step import Loop, Step, make_loop, make_step
+from deploy.step import Loop, Step, gain_rate, make_loop, make_step
 from wire.artefact import GainsArtefact, Setpoint
 from wire.errors import OctarmError, UsageError
 from wire.factors import INPUTS, OUTPUTS, STATES, NodeFactors, SweepFactors
@@ -104,6 +104,14 @@ def deploy(
     if isinstance(tick_s, bool) or not (math.isfinite(tick_s) and tick_s > 0.0):
         raise UsageError(f"tick: expected a positive number of seconds, got {tick_s!r}")
     loops = tuple(make_loop(artefact.arm, setpoint, grid) for setpoint in artefact.setpoints)
+    for setpoint, loop in zip(artefact.setpoints, loops, strict=True):
+        rate = gain_rate(loop)
+        if tick_s * rate > 1.0:
+            raise UsageError(
+                f"tick {tick_s:g} s is too long: at setpoint {setpoint.name!r} the gains act within "
+                f"{1.0 / rate:.3g} s, and what they do in one tick is not what was designed; use a "
+                "tick well below that"
+            )
     steps = [make_step(loop, tick_s) for loop in loops]
     modes = [make_arm_modes(artefact.arm, one.curvature_per_m, grid) for one in artefact.setpoints]
     pairs = tuple(zip(loops, modes, strict=True))

@@ -129,6 +129,18 @@ def make_loop(arm: Arm, setpoint: Setpoint, grid: SegmentGrid) -> Loop:
     )
 
 
+def gain_rate(loop: Loop) -> float:
+    """How fast the gains act, 1/s: the larger norm of K B and C L on scaled quantities.
+
+    A tick longer than its inverse leaves nothing of the designed loop: the implicit step stays stable
+    (no gain acts as more than 1 / tick) but neither observer nor controller is the certified one.
+    """
+    y, u = loop.measurement_scale, loop.command_scale
+    feedback = u[:, None] * (loop.K @ loop.model.B) / u
+    innovation = y[:, None] * (loop.model.C @ loop.L) / y
+    return float(max(np.linalg.norm(feedback, 2), np.linalg.norm(innovation, 2)))
+
+
 def make_step(loop: Loop, tick_s: float) -> Step:
     """Discretise one tick of length tick_s."""
     h, n = tick_s, len(loop.command_scale)

@@ -179,3 +179,11 @@ def test_gains_that_feed_the_arm_are_refused_at_any_tick() -> None:
     artefact = make_artefact([STRAIGHT], operators=[gains(size_per_s=-0.5)])
     with pytest.raises(UsageError, match=r"'shape 0'.*no tick makes these gains stable"):
         deploy(artefact, 4, TICK)
+
+
+@pytest.mark.parametrize("nodes", [2, 5, 10])
+@pytest.mark.parametrize("tick_s", [5.0, 1000.0])
+def test_a_tick_in_which_the_gains_cannot_act_is_refused(nodes: int, tick_s: float) -> None:
+    """The implicit step is stable at such ticks again, but it is not the designed loop any more."""
+    with pytest.raises(UsageError, match=f"tick {tick_s:g} s is too long"):
+        deploy(make_artefact(), nodes, tick_s)
