@@ -66,26 +66,28 @@ def factorise(
 ) -> tuple[GainFactors, float]:
     """Factors of minimal rank; returns them and the share of the gain that was dropped.
 
-    rank_tolerance: directions of a kernel smaller than this times the gain's norm are dropped (L2 over
-    the square, so it bounds the operator norm). fit_tolerance: the same for polynomial coefficients.
+    rank_tolerance: directions of a kernel smaller than this times the gain's size are dropped, where the
+    size is the largest L2 norm of an entry of the multiplier or singular value of a kernel. The share is
+    their root sum of squares over the whole square: it bounds the operator norm of what was dropped.
+    fit_tolerance: the same for polynomial coefficients.
     """
     n0 = legendre.fit(gain.multiplier)
     kernels = [(gain.outer1, gain.inner1), (gain.outer2, gain.inner2)]
     split = [_split(legendre.fit(outer), legendre.fit(inner)) for outer, inner in kernels]
     level = max(
-        float(np.abs(np.linalg.norm(n0, axis=2)).max()), *(float(v[0]) for _, v, _ in split)
+        float(np.linalg.norm(n0, axis=2).max()), *(float(v.max(initial=0.0)) for _, v, _ in split)
     )
     dropped = 0.0
     parts: list[Array] = []
     for left, values, right in split:
         keep = int(np.count_nonzero(values > rank_tolerance * level))
-        dropped = max(dropped, float(values[keep]) / level if keep < values.size else 0.0)
+        dropped += float(np.sum((values[keep:] / max(level, 1e-300)) ** 2))
         root = np.sqrt(values[:keep])
         cut = fit_tolerance * np.sqrt(level)
         parts.append(legendre.trim(left[:, :keep] * root[None, :, None], (2,), cut))
         parts.append(legendre.trim(right[:keep] * root[:, None, None], (2,), cut))
     n0 = legendre.trim(n0, (2,), fit_tolerance * level)
-    return GainFactors(n0, *parts), dropped
+    return GainFactors(n0, *parts), float(np.sqrt(dropped))
 
 
 def _split(outer: Array, inner: Array) -> tuple[Array, Array, Array]:

@@ -18,7 +18,11 @@ from design.legendre import Array
 from design.operators import PIOperator
 
 ODE_TOLERANCE = 1e-12
+SINGULAR = 1e-12
+"""Singular values below this, relative to the largest, count as zero."""
 MOST_NODES = 96
+MOST_EVALUATIONS = 10_000
+"""Of the ODE's right side; gains take some hundreds, a multiplier that almost vanishes takes any number."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +89,6 @@ def _solve_at(P: PIOperator, Z: PIOperator, count: int) -> SampledKernels:
     def system(s: Array) -> tuple[Array, Array, Array, Array]:
         """theta' = M theta + N eta, x = C theta + D eta for theta = (c, d, a, b)."""
         r0 = at(P.r0, s)
-        if np.any(np.linalg.cond(r0) > 1e12):
-            raise ArithmeticError("the multiplier of P is singular: P is not coercive")
         C = np.linalg.solve(
             r0, np.concatenate([-at(f1, s), -at(f2, s), at(a1, s), at(a2, s)], axis=2)
         )
@@ -97,20 +99,35 @@ def _solve_at(P: PIOperator, Z: PIOperator, count: int) -> SampledKernels:
         N = np.concatenate([G @ D, at(b1, s), -at(b2, s)], axis=1)
         return M, N, np.asarray(C), np.asarray(D)
 
+    evaluations = 0
+
     def rate(s: float, u: Array) -> Array:
+        nonlocal evaluations
+        evaluations += 1
+        if evaluations > MOST_EVALUATIONS:
+            raise ArithmeticError(
+                f"P^-1 Z varies too fast at s = {s:.4g}: the multiplier of P is almost singular there"
+            )
         M = system(np.array([s]))[0][0]
         return np.asarray(M @ u.reshape(size, size)).ravel()
 
+    _check_multiplier(at(P.r0, np.concatenate([[0.0], nodes, [1.0]])))
     _, N, C, D = system(nodes)
-    grid = np.append(nodes, 1.0)
-    solution = solve_ivp(
-        rate, (0.0, 1.0), np.eye(size).ravel(), "DOP853", grid, rtol=ODE_TOLERANCE, atol=1e-14
-    )
-    U = solution.y.T.reshape(-1, size, size)
+    U = np.zeros((count + 1, size, size))
+    if size:
+        grid = np.append(nodes, 1.0)
+        solution = solve_ivp(
+            rate, (0.0, 1.0), np.eye(size).ravel(), "DOP853", grid, rtol=ODE_TOLERANCE, atol=1e-14
+        )
+        if not solution.success:
+            raise ArithmeticError(f"P^-1 Z cannot be integrated along the arm: {solution.message}")
+        U = solution.y.T.reshape(-1, size, size)
     ends = np.concatenate([np.arange(r1, r1 + r2), np.arange(size - k2, size)])
     boundary = U[-1][np.ix_(ends, ends)]
-    if np.linalg.cond(boundary) > 1e12:
-        raise ArithmeticError("the boundary matrix of P is singular: P is not coercive")
+    if ends.size:  # relative to its rows: one by one, a matrix is as good as its neighbours
+        smallest = np.linalg.svd(boundary, compute_uv=False)[-1]
+        if not smallest > SINGULAR * np.linalg.norm(U[-1][ends], 2):
+            raise ArithmeticError("the boundary matrix of P is singular: P is not coercive")
     project = np.zeros((size, size))
     project[ends] = np.linalg.solve(boundary, U[-1][ends])
     outer = C @ U[:-1]
@@ -124,6 +141,14 @@ def _solve_at(P: PIOperator, Z: PIOperator, count: int) -> SampledKernels:
     }
     sampled = {key: np.moveaxis(value, 0, 2) for key, value in factors.items()}
     return SampledKernels(**sampled, tail=max(_tail(v) for v in sampled.values()))
+
+
+def _check_multiplier(r0: Array) -> None:
+    """ArithmeticError unless the samples (points, n, n) are invertible and so is what lies between."""
+    values = np.linalg.svd(r0, compute_uv=False)
+    signs = np.linalg.slogdet(r0).sign
+    if not values.min() > SINGULAR * values.max() or np.any(signs != signs[0]):
+        raise ArithmeticError("the multiplier of P is singular: P is not coercive")
 
 
 def _tail(samples: Array) -> float:

@@ -113,8 +113,8 @@ def trim(coefficients: Array, axes: tuple[int, ...], tolerance: float = 0.0) -> 
     """
     out = coefficients
     for axis in axes:
-        moved = np.moveaxis(np.abs(out), axis, 0).reshape(out.shape[axis], -1)
-        largest = moved.max(axis=1, initial=0.0)
+        others = tuple(k for k in range(out.ndim) if k != axis % out.ndim)
+        largest = np.abs(out).max(axis=others, initial=0.0)
         present = np.flatnonzero(~((largest <= tolerance) & np.isfinite(largest)))
         keep = int(present[-1]) + 1 if present.size else 1
         out = np.take(out, np.arange(keep), axis=axis)
