@@ -33,12 +33,21 @@ def energy_norm(deviation: Array, weights: Array) -> Array:
     return np.sqrt(squares)
 
 
+NO_INITIAL_ERROR = 1e-6
+"""A first value below this share of the largest one is no initial error to be relative to."""
+
+
 def relative(values: Array) -> Array:
-    """The values divided by the first one; NaN throughout if the first is zero or not finite."""
+    """The values divided by the first one; NaN throughout if that is not finite or next to nothing.
+
+    Next to nothing: below `NO_INITIAL_ERROR` of the largest value, as when a run starts at rest in its
+    setpoint and only a disturbance makes an error.
+    """
     if values.size == 0:
         return values.copy()
     first = float(values[0])
-    if not math.isfinite(first) or first == 0.0:
+    largest = float(np.max(values[np.isfinite(values)], initial=0.0))
+    if not math.isfinite(first) or first <= NO_INITIAL_ERROR * largest:
         return np.full(values.shape, np.nan)
     return values / first
 

@@ -24,6 +24,7 @@ from analysis.metrics import (
     time_below,
 )
 from analysis.recording import Recording
+from analysis.shape_error import shape_error
 from deploy import DenseStep
 from wire.channels import MEASUREMENT, STATE
 
@@ -56,10 +57,10 @@ def open_loop_run(step: DenseStep, initial_estimates: Array, commands: Array) ->
 
 @dataclass(frozen=True)
 class ErrorCourse:
-    """Estimation error of one estimator over a run."""
+    """Estimation error of one estimator over a run, in one norm."""
 
     norm: Array
-    """(K,) energy norm of estimate - truth, J^(1/2)."""
+    """(K,) the norm's value, see `EstimationErrors`."""
     relative: Array
     """(K,) the same divided by its value at tick 0."""
     below_1_percent_s: float | None
@@ -70,9 +71,18 @@ class ErrorCourse:
     """Fitted exponential rate over the second half of the run."""
 
 
-def error_course(times_s: Array, truth: Array, estimates: Array, weights: Array) -> ErrorCourse:
-    """Estimation error over time; truth and estimates: (K, n, 4), energy weights: (n, 4)."""
-    norm = energy_norm(estimates - truth, weights)
+@dataclass(frozen=True)
+class EstimationErrors:
+    """Error of one estimator in both norms."""
+
+    energy: ErrorCourse
+    """Energy norm of estimate - truth, J^(1/2) (`analysis.metrics.energy_norm`)."""
+    shape: ErrorCourse
+    """Root-mean-square distance of estimated and true faces, m (`analysis.shape_error`)."""
+
+
+def error_course(times_s: Array, norm: Array) -> ErrorCourse:
+    """What is told of an error over time; times_s and norm: (K,)."""
     share = relative(norm)
     reached = time_below(times_s, share, THRESHOLD)
     return ErrorCourse(
@@ -86,15 +96,21 @@ def error_course(times_s: Array, truth: Array, estimates: Array, weights: Array)
     )
 
 
-def compare_with_open_loop(recording: Recording) -> tuple[ErrorCourse, ErrorCourse]:
-    """Error over time of the recorded observer and of the open-loop model, in this order."""
+def estimation_errors(recording: Recording, estimates: Array) -> EstimationErrors:
+    """Error over time of estimates (K, n, 4), absolute, against the recorded truth."""
+    faces = np.asarray(recording.configuration.faces_m)
+    times, truth = recording.times_s, recording.truth
+    return EstimationErrors(
+        energy=error_course(times, energy_norm(estimates - truth, recording.energy_weights)),
+        shape=error_course(times, shape_error(estimates, truth, faces)),
+    )
+
+
+def compare_with_open_loop(recording: Recording) -> tuple[EstimationErrors, EstimationErrors]:
+    """Errors over time of the recorded observer and of the open-loop model, in this order."""
     model = open_loop_run(
         recording.deployment.dense[recording.configuration.setpoint_index],
         recording.initial_estimates,
         recording.commands,
     )
-    observer, open_loop = (
-        error_course(recording.times_s, recording.truth, estimates, recording.energy_weights)
-        for estimates in (recording.estimates, model)
-    )
-    return observer, open_loop
+    return estimation_errors(recording, recording.estimates), estimation_errors(recording, model)

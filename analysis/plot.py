@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import PercentFormatter
 
-from analysis.open_loop import THRESHOLD, ErrorCourse, compare_with_open_loop
+from analysis.open_loop import THRESHOLD, EstimationErrors, compare_with_open_loop
 from analysis.recording import Recording, read_recording
 from wire.artefact import Setpoint
 from wire.errors import UsageError
@@ -147,22 +147,31 @@ def draw_shapes(ax: Any, recording: Recording) -> None:
 
 
 def draw_estimation(
-    ax: Any, recording: Recording, observer: ErrorCourse, model: ErrorCourse
+    ax: Any, recording: Recording, observer: EstimationErrors, model: EstimationErrors
 ) -> None:
-    """Estimation error relative to its initial value, observer and open-loop model."""
+    """Estimation errors relative to their initial values, observer and open-loop model."""
     times = recording.times_s
-    for course, colour, name in (
+    for errors, colour, name in (
         (model, VERMILION, "open-loop model"),
         (observer, BLUE, "observer"),
     ):
-        ax.semilogy(times, course.relative, color=colour, linewidth=1.6, label=name)
-        if course.below_1_percent_s is not None:
-            ax.plot(course.below_1_percent_s, THRESHOLD, "o", color=colour, markersize=6)
+        for course, norm, width, dashes in (
+            (errors.energy, "energy norm", 1.6, "-"),
+            (errors.shape, "shape", 1.0, (0, (4, 1.5))),
+        ):
+            ax.semilogy(
+                times,
+                course.relative,
+                color=colour,
+                linewidth=width,
+                linestyle=dashes,
+                label=f"{name}, {norm}",
+            )
+            if course.below_1_percent_s is not None:
+                ax.plot(course.below_1_percent_s, THRESHOLD, "o", color=colour, markersize=6)
     ax.axhline(THRESHOLD, color=GREY, linewidth=0.9, linestyle=":")
     ax.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=None))
-    ax.set(
-        xlabel="time [s]", ylabel="energy norm, share of initial", title="State estimation error"
-    )
+    ax.set(xlabel="time [s]", ylabel="share of initial error", title="State estimation error")
     ax.legend(frameon=False)
     tidy(ax, times)
 

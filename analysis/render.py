@@ -35,11 +35,7 @@ def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
     """The rows of the table: (figure, value, meaning)."""
     seconds = s["ticks"] * s["tick_s"]
     short = "" if s["ticks"] == s["ticks_asked_for"] else f" of {s['ticks_asked_for']}"
-    sweep, reached, later = (
-        s["sweep_ms"],
-        s["estimation_below_1_percent_s"],
-        s["estimation_below_1_percent_extrapolated_s"],
-    )
+    sweep, linear = s["sweep_ms"], s["linear_model_below_1_percent_s"]
     out = [
         (
             "run",
@@ -69,10 +65,20 @@ def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
             _course(s["estimation_error"], "%", 100.0),
             f"energy norm; open-loop model {_course(s['open_loop_model_error'], '%', 100.0)}",
         ),
+        _below_1_percent(s, "estimation"),
         (
-            "  below 1 % after",
-            _time(reached["observer"]),
-            f"open-loop model {_time(reached['open_loop_model'], later['open_loop_model'])}",
+            "shape estimation error",
+            f"{_course(s['shape_estimation_error'], '%', 100.0)} "
+            f"({_number(s['shape_estimation_error_m']['final'], 'mm', scale=1e3)})",
+            "rms distance of estimated from true arm; open-loop model "
+            f"{_course(s['open_loop_model_shape_error'], '%', 100.0)}",
+        ),
+        _below_1_percent(s, "shape"),
+        (
+            "  on the linear model",
+            _time(linear["observer"], none="not within an hour"),
+            "below 1 %, energy norm, without noise and disturbance; open-loop model "
+            f"{_time(linear['open_loop_model'], none='not within an hour')}",
         ),
         (
             "tip error",
@@ -104,6 +110,16 @@ def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
         ("gains", s["artefact_sha256"][:16], "SHA-256 of the artefact, first 16 digits"),
     ]
     return out
+
+
+def _below_1_percent(s: dict[str, Any], norm: str) -> tuple[str, str, str]:
+    """The row that says when the error in the norm of the row above stays below 1 %."""
+    reached, later = s[f"{norm}_below_1_percent_s"], s[f"{norm}_below_1_percent_extrapolated_s"]
+    return (
+        "  below 1 % after",
+        _time(reached["observer"]),
+        f"open-loop model {_time(reached['open_loop_model'], later['open_loop_model'])}",
+    )
 
 
 def _traffic(s: dict[str, Any]) -> str:
@@ -138,9 +154,11 @@ def _course(ends: dict[str, float | None], unit: str, scale: float) -> str:
     return f"{first * scale:.3g} -> {last * scale:.3g} {unit}"
 
 
-def _time(value: float | None, extrapolated: float | None = None) -> str:
+def _time(
+    value: float | None, extrapolated: float | None = None, none: str = "not within the run"
+) -> str:
     if value is not None:
         return f"{value:.3g} s"
     if extrapolated is not None:
-        return f"not within the run (extrapolated: {extrapolated:.3g} s)"
-    return "not within the run"
+        return f"{none} (extrapolated: {extrapolated:.3g} s)"
+    return none

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from analysis.central import CentralComparison, compare_with_central
+from analysis.linear import linear_decay
 from analysis.metrics import control_effort, time_below
-from analysis.open_loop import compare_with_open_loop
+from analysis.open_loop import ErrorCourse, compare_with_open_loop
 from analysis.recording import Recording, read_recording
 from analysis.render import render
 from wire.artefact import Certificate
@@ -47,6 +48,7 @@ def summary_of(recording: Recording) -> dict[str, Any]:
     run = recording.configuration
     central = compare_with_central(recording)
     observer, model = compare_with_open_loop(recording)
+    linear = linear_decay(recording)
     durations = recording.sweep_durations_ms[np.isfinite(recording.sweep_durations_ms)]
     tip = recording.tip_error_m
     effort = control_effort(recording.commands, np.asarray(run.faces_m), run.tick_s)
@@ -67,19 +69,21 @@ def summary_of(recording: Recording) -> dict[str, Any]:
         "start_up_s": _start_up(recording),
         "max_difference_to_central": central.worst.relative,
         "difference_to_central": _central(central),
-        "estimation_error": _ends(observer.relative),
-        "estimation_error_root_joule": _ends(observer.norm),
-        "open_loop_model_error": _ends(model.relative),
-        "estimation_below_1_percent_s": {
-            "observer": observer.below_1_percent_s,
-            "open_loop_model": model.below_1_percent_s,
-        },
-        "estimation_below_1_percent_extrapolated_s": {
-            "open_loop_model": model.below_1_percent_extrapolated_s,
-        },
+        "estimation_error": _ends(observer.energy.relative),
+        "estimation_error_root_joule": _ends(observer.energy.norm),
+        "open_loop_model_error": _ends(model.energy.relative),
+        **_below_1_percent("estimation", observer.energy, model.energy),
         "estimation_decay_per_s": {
-            "observer": observer.decay_per_s,
-            "open_loop_model": model.decay_per_s,
+            "observer": observer.energy.decay_per_s,
+            "open_loop_model": model.energy.decay_per_s,
+        },
+        "shape_estimation_error": _ends(observer.shape.relative),
+        "shape_estimation_error_m": _ends(observer.shape.norm),
+        "open_loop_model_shape_error": _ends(model.shape.relative),
+        **_below_1_percent("shape", observer.shape, model.shape),
+        "linear_model_below_1_percent_s": {
+            "observer": linear.observer_s,
+            "open_loop_model": linear.open_loop_model_s,
         },
         "tip_error_m": _ends(tip),
         "tip_settling_s": time_below(recording.times_s, tip, SETTLED * float(tip[0])),
@@ -168,6 +172,19 @@ def _central(central: CentralComparison) -> dict[str, Any]:
         "values_missing": central.missing,
         "by_quantity": central.per_quantity,
         "first_above_1e-12": first and {"tick": first.tick, "node": first.node},
+    }
+
+
+def _below_1_percent(norm: str, observer: ErrorCourse, model: ErrorCourse) -> dict[str, Any]:
+    """When the errors are below 1 % in this norm; extrapolated for the model only if it is not."""
+    return {
+        f"{norm}_below_1_percent_s": {
+            "observer": observer.below_1_percent_s,
+            "open_loop_model": model.below_1_percent_s,
+        },
+        f"{norm}_below_1_percent_extrapolated_s": {
+            "open_loop_model": model.below_1_percent_extrapolated_s,
+        },
     }
 
 

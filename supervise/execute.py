@@ -106,14 +106,16 @@ def _conclude(result: Result, view: View, plot: bool) -> None:
     if not result.recording.exists():
         return
     try:
-        from analysis.summary import summarise
+        from analysis.recording import read_recording
+        from analysis.summary import summary_of
 
-        result.summary = dict(summarise(result.recording))
+        recording = read_recording(result.recording)
+        result.summary = summary_of(recording)
         if plot and outcome.ticks > 1:
-            from analysis.plot import plot_run
+            from analysis.plot import plot_recording
 
             target = result.directory / PLOT
-            plot_run(result.recording, target)
+            plot_recording(recording, target)
             result.plot = target
     except Exception as error:
         if outcome.exit_code is not ExitCode.OK:

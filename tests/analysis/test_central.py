@@ -117,7 +117,7 @@ def test_without_correction_the_error_decays_by_the_arms_damping_only(tmp_path: 
     path = tmp_path / "recording.mcap"
     write_recording(path, Scenario(nodes=4, ticks=1500, setpoint="straight", noise=(0.0, 0.0)))
     recording = read_recording(path)
-    observer, model = compare_with_open_loop(recording)
+    observer, model = (errors.energy for errors in compare_with_open_loop(recording))
     assert model.relative[0] == observer.relative[0] == 1.0
     assert model.decay_per_s == pytest.approx(0.5 * recording.artefact.arm.drag_per_s, rel=0.3)
     assert model.below_1_percent_s is None
