@@ -90,7 +90,8 @@ def decay_time(
             break  # it grows without bound, or is over
         block = power @ block
     course: Array = np.asarray(np.concatenate(shares), dtype=np.float64)
-    return time_below(np.arange(course.size) * tick_s, course, threshold)
+    times: Array = np.arange(course.size, dtype=np.float64) * tick_s
+    return time_below(times, course, threshold)
 
 
 def linear_decay(recording: Recording) -> LinearDecay:

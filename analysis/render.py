@@ -150,7 +150,7 @@ def _number(value: float | None, unit: str, digits: int = 3, scale: float = 1.0)
 def _course(ends: dict[str, float | None], unit: str, scale: float) -> str:
     first, last = ends["initial"], ends["final"]
     if first is None or last is None:
-        return "unknown"
+        return "no initial error" if unit == "%" else "unknown"
     return f"{first * scale:.3g} -> {last * scale:.3g} {unit}"
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from analysis.central import CentralComparison, compare_with_central
-from analysis.linear import linear_decay
+from analysis.linear import LinearDecay, linear_decay
 from analysis.metrics import control_effort, time_below
 from analysis.open_loop import ErrorCourse, compare_with_open_loop
 from analysis.recording import Recording, read_recording
@@ -48,7 +48,8 @@ def summary_of(recording: Recording) -> dict[str, Any]:
     run = recording.configuration
     central = compare_with_central(recording)
     observer, model = compare_with_open_loop(recording)
-    linear = linear_decay(recording)
+    has_error = bool(np.isfinite(observer.energy.relative).any())
+    linear = linear_decay(recording) if has_error else LinearDecay(None, None)
     durations = recording.sweep_durations_ms[np.isfinite(recording.sweep_durations_ms)]
     tip = recording.tip_error_m
     effort = control_effort(recording.commands, np.asarray(run.faces_m), run.tick_s)
