@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -22,12 +23,15 @@ from design.arm_file import time_unit_s
 from wire.artefact import Arm, Setpoint
 
 Array = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
 
 GRIDS = (40, 80)
 """Segments of the two grids; the norms at both give the extrapolated value (second order)."""
 RICCATI_GRID = 16
 _ON_THE_AXIS = 1e-12
 """Real parts below this share of the largest eigenvalue are rounding: such a mode does not decay."""
+PEAKS = 5
+"""Local maxima of the sweep that are refined, the highest ones."""
 FREQUENCIES = np.concatenate([[0.0], np.geomspace(1e-2, 1e3, 120)])
 
 
@@ -40,35 +44,50 @@ class Channel:
     C: Array
     D: Array
 
+    @cached_property
+    def _schur(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Triangular T, and input and output matrix in its coordinates: a frequency costs one sweep."""
+        T, Q = linalg.schur(self.A.astype(np.complex128), output="complex")
+        return T, Q.conj().T @ self.B, self.C @ Q
+
     def norm_at(self, omega: float) -> float:
         """Largest singular value of the transfer function at i omega."""
-        matrix = np.asarray(1j * omega * np.eye(len(self.A)) - self.A, dtype=np.complex128)
-        response = self.C @ np.linalg.solve(matrix, self.B.astype(np.complex128)) + self.D
+        T, B, C = self._schur
+        shifted = 1j * omega * np.eye(len(T)) - T
+        response = C @ linalg.solve_triangular(shifted, B, check_finite=False) + self.D
         return float(np.linalg.norm(response, 2))
 
     def hinf_norm(self) -> float:
         """H-infinity norm by a sweep over frequencies and a refinement at the highest peaks.
 
-        Infinite unless all modes of A decay: the sweep would otherwise return a finite number.
+        The sweep visits the frequency of every eigenvalue and the flanks of its resonance, so that no
+        peak is too narrow for it. Infinite unless all modes of A decay: the sweep would otherwise return
+        a finite number.
         """
         if self.decay() <= 0.0:
             return float("inf")
-        values = np.array([self.norm_at(w) for w in FREQUENCIES])
+        poles = np.diag(self._schur[0])
+        resonances = [np.abs(poles.imag) + k * np.abs(poles.real) for k in (-1.0, 0.0, 1.0)]
+        sweep = np.unique(np.concatenate([FREQUENCIES, *resonances]).clip(0.0))
+        sweep = sweep[np.append(True, np.diff(sweep) > 1e-8 * sweep[1:])]  # equal but for rounding
+        values = np.array([self.norm_at(w) for w in sweep])
+        padded = np.concatenate([[-np.inf], values, [-np.inf]])
+        peaks = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]))
         best = float(values.max())
-        for k in np.argsort(values)[-3:]:
-            low, high = FREQUENCIES[max(k - 1, 0)], FREQUENCIES[min(k + 1, len(values) - 1)]
+        for k in peaks[np.argsort(values[peaks])[-PEAKS:]]:
+            low, high = sweep[max(k - 1, 0)], sweep[min(k + 1, len(sweep) - 1)]
             found = minimize_scalar(
                 lambda w: -self.norm_at(w),
                 bounds=(low, high),
                 method="bounded",
-                options={"xatol": 1e-4},
+                options={"xatol": 1e-6 * high},
             )
             best = max(best, -float(found.fun))
         return best
 
     def decay(self) -> float:
         """Minus the largest real part of the eigenvalues of A; zero where it is no more than rounding."""
-        values = np.linalg.eigvals(self.A)
+        values = np.diag(self._schur[0])
         slowest = -float(values.real.max())
         return slowest if abs(slowest) > _ON_THE_AXIS * np.abs(values).max() else 0.0
 

@@ -1,0 +1,221 @@
+"""The verification's own numbers: norms against closed forms, optima against hand-solved Riccati equations,
+the straight arm against beam modes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from beam_modes import beam, controller_optimum, norm, observer_optimum
+
+from design.verify import (
+    GRIDS,
+    Channel,
+    riccati_optimum,
+    verify_controller,
+    verify_observer,
+)
+from wire.artefact import Arm, Certificate, OperatorFactors, PolynomialMatrix, Setpoint
+
+Array = npt.NDArray[np.float64]
+LENGTH, RADIUS, MODULUS, DENSITY = 0.7, 0.02, 8e3, 1.2e3
+TIME = LENGTH**2 * math.sqrt(DENSITY * 4.0 / (MODULUS * RADIUS**2))
+DRAG = 0.7
+"""Nondimensional."""
+
+
+def channel(A: object, B: object, C: object, D: object = 0.0) -> Channel:
+    a, b, c, d = (np.atleast_2d(np.asarray(v, dtype=np.float64)) for v in (A, B, C, D))
+    return Channel(a, b, c, np.broadcast_to(d, (len(c), b.shape[1])).astype(np.float64))
+
+
+# H-infinity norms
+
+
+def test_first_order_lag() -> None:
+    """1 / (s + 1) has its peak 1 at frequency 0; 1 / (s + 1) - 1 = -s / (s + 1) at infinity."""
+    assert channel(-1.0, 1.0, 1.0).hinf_norm() == pytest.approx(1.0, rel=1e-12)
+    assert channel(-1.0, 1.0, 1.0, -1.0).hinf_norm() == pytest.approx(1.0, rel=1e-5)
+
+
+@pytest.mark.parametrize("damping", [0.5, 1e-1, 1e-2, 1e-3])
+@pytest.mark.parametrize("frequency", [0.037, 1.0, 3.51, 61.7])
+def test_oscillator(frequency: float, damping: float) -> None:
+    """w^2 / (s^2 + 2 z w s + w^2) peaks at 1 / (2 z sqrt(1 - z^2))."""
+    w, z = frequency, damping
+    A = w * np.array([[0.0, 1.0], [-1.0, -2.0 * z]])
+    got = channel(A, [[0.0], [w]], [[1.0, 0.0]]).hinf_norm()
+    assert got == pytest.approx(0.5 / (z * math.sqrt(1.0 - z**2)), rel=1e-3)
+
+
+def test_several_peaks() -> None:
+    """A dozen light modes of known peaks: the largest is found although others are nearby."""
+    frequencies = np.array([0.31, 0.9, 2.2, 2.4, 7.0, 11.0, 19.0, 33.0, 52.0, 90.0, 150.0, 240.0])
+    dampings = np.linspace(0.02, 0.05, frequencies.size)
+    blocks = np.zeros((24, 24))
+    B, C = np.zeros((24, 12)), np.zeros((12, 24))
+    for k, (w, z) in enumerate(zip(frequencies, dampings, strict=True)):
+        blocks[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = w * np.array([[0.0, 1.0], [-1.0, -2.0 * z]])
+        B[2 * k + 1, k], C[k, 2 * k] = w, 1.0
+    got = channel(blocks, B, C).hinf_norm()
+    assert got == pytest.approx(0.5 / (0.02 * math.sqrt(1.0 - 0.02**2)), rel=1e-3)
+
+
+def test_dense_sweep_of_random_systems() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        A = rng.normal(size=(8, 8))
+        A -= (np.linalg.eigvals(A).real.max() + 0.3) * np.eye(8)
+        B, C, D = rng.normal(size=(8, 3)), rng.normal(size=(2, 8)), 0.2 * rng.normal(size=(2, 3))
+        got = Channel(A, B, C, D).hinf_norm()
+        dense = max(
+            float(np.linalg.svd(C @ np.linalg.inv(1j * w * np.eye(8) - A) @ B + D)[1][0])
+            for w in np.concatenate([np.linspace(0.0, 12.0, 12001), np.geomspace(12.0, 1e4, 200)])
+        )
+        assert got == pytest.approx(dense, rel=1e-4)
+
+
+def test_no_finite_norm_without_decay() -> None:
+    assert channel(0.1, 1.0, 1.0).hinf_norm() == math.inf
+    assert channel(0.0, 1.0, 1.0).hinf_norm() == math.inf
+    unseen = channel(np.diag([-1.0, 0.5]), [[1.0], [0.0]], [[1.0, 0.0]])
+    assert unseen.hinf_norm() == math.inf  # unstable though no output shows it
+
+
+def test_decay() -> None:
+    A = np.array([[-0.2, 5.0, 1.0], [-5.0, -0.2, 0.0], [0.0, 0.0, -0.7]])
+    assert channel(A, np.ones((3, 1)), np.ones((1, 3))).decay() == pytest.approx(0.2, rel=1e-12)
+    rng = np.random.default_rng(1)
+    skew = rng.normal(size=(40, 40)) * 1e3
+    skew = skew - skew.T
+    oscillating = channel(skew, np.ones((40, 1)), np.ones((1, 40)))
+    assert oscillating.decay() == 0.0  # rounding is no decay
+    assert oscillating.hinf_norm() == math.inf
+    slow = channel(skew - 1e-6 * np.eye(40), np.ones((40, 1)), np.ones((1, 40)))
+    assert slow.decay() == pytest.approx(1e-6, rel=1e-3)
+
+
+# Riccati optima
+
+
+@pytest.mark.parametrize(
+    ("a", "w", "b", "c", "effort"),
+    [(1.0, 1.0, 1.0, 1.0, 1.0), (-0.3, 2.0, 0.5, 1.5, 0.1), (4.0, 0.2, 3.0, 1.0, 2.0)],
+)
+def test_scalar_optimum(a: float, w: float, b: float, c: float, effort: float) -> None:
+    """x_t = a x + w v + b u, z = (c x, r u): gamma* from q X^2 + 2 a X + c^2 = 0, q = w^2/g^2 - b^2/r^2.
+
+    With u = -k x the norm at frequency 0 is w sqrt(c^2 + r^2 k^2) / (b k - a), and that is its peak;
+    minimising over k > a / b gives k = -c^2 b / (a r^2) for a < 0, or lets k grow for a >= 0: w r / b
+    is then the infimum unless a > 0, where no k does better than the minimum over k found here by a scan.
+    """
+    k = np.concatenate([np.linspace(0.0, 50.0, 200001), np.geomspace(50.0, 1e7, 20000)])
+    k = k[b * k - a > 0.0]
+    brute = float(np.min(w * np.sqrt(c**2 + effort**2 * k**2) / (b * k - a)))
+    one = np.ones((1, 1))
+    got = riccati_optimum(a * one, w * one, c * one, b * one, effort)
+    assert got == pytest.approx(brute, rel=2e-4)
+    if a < 0.0:
+        closed = w * c / math.sqrt(a**2 + (b * c / effort) ** 2)
+        assert got == pytest.approx(closed, rel=2e-4)
+
+
+def test_optimum_against_another_solver() -> None:
+    for modes, drag in ((3, 0.7), (5, 0.2)):
+        model = beam(modes, drag)
+        for effort in (0.05, 1.0):
+            force = np.vstack([np.eye(modes), np.zeros((modes, modes))])
+            got = riccati_optimum(model.A, model.B, model.C, force, effort)
+            assert got == pytest.approx(controller_optimum(model, effort), rel=2e-4)
+
+
+def test_uncontrollable_growth_has_no_optimum() -> None:
+    one, zero = np.ones((1, 1)), np.zeros((1, 1))
+    assert riccati_optimum(one, one, one, zero, 1.0) == math.inf
+
+
+# The arm on the grids
+
+
+def arm(drag: float = DRAG) -> Arm:
+    return Arm("other", LENGTH, RADIUS, MODULUS, DENSITY, drag / TIME)
+
+
+def multiplier(entries: Array) -> OperatorFactors:
+    """A gain that acts point by point, with constant coefficients and no sums."""
+    q, m = entries.shape
+    return OperatorFactors(
+        n0=PolynomialMatrix.from_array(entries[:, :, None]),
+        n1a=PolynomialMatrix.from_array(np.zeros((q, 0, 1))),
+        n1b=PolynomialMatrix.from_array(np.zeros((0, m, 1))),
+        n2a=PolynomialMatrix.from_array(np.zeros((q, 0, 1))),
+        n2b=PolynomialMatrix.from_array(np.zeros((0, m, 1))),
+    )
+
+
+def straight(damping: float) -> Setpoint:
+    """Observer v_y' = ... - damping (v_y - y) and controller f = -damping v_y, nondimensional damping."""
+    observer, controller = np.zeros((4, 2)), np.zeros((1, 4))
+    observer[1, 0] = -damping / TIME
+    controller[0, 1] = -damping * DENSITY * math.pi * RADIUS**2 / TIME
+    blank = Certificate("unverified", *(0.0,) * 9, [], 0, 0, "", "", 0.0)
+    return Setpoint(
+        "straight", [0.0], [0.0], [0.0], [LENGTH, 0.0],
+        multiplier(observer), multiplier(controller), blank, blank,
+    )  # fmt: skip
+
+
+MODES = 10
+
+
+def test_straight_arm_with_a_known_gain() -> None:
+    """Both gains add drag to every mode: in beam modes the closed loops are known."""
+    added, weight = 2.0, 0.3
+    model = beam(MODES, DRAG)
+    damp = np.diag(np.repeat([-added, 0.0], MODES))
+    observer = verify_observer(arm(), straight(added), weight)
+    noise = -weight * damp[:, :MODES]
+    exact = norm(model.A + damp, np.hstack([model.B, noise]), model.C)
+    assert observer.gamma == pytest.approx(exact, rel=2e-3)
+    assert observer.optimum_gamma == pytest.approx(observer_optimum(model, weight), rel=5e-3)
+    assert observer.gamma_by_grid[0] != observer.gamma_by_grid[1]
+    assert observer.gamma >= observer.gamma_by_grid[1]
+
+    controller = verify_controller(arm(), straight(added), weight)
+    effort = np.hstack([-weight * added * np.eye(MODES), np.zeros((MODES, MODES))])
+    exact = norm(model.A + damp, model.B, np.vstack([model.C, effort]))
+    assert controller.gamma == pytest.approx(exact, rel=2e-3)
+    assert controller.optimum_gamma == pytest.approx(controller_optimum(model, weight), rel=5e-3)
+
+    open_loop = norm(model.A, model.B, model.C)
+    for achieved in (observer, controller):
+        assert achieved.open_loop_gamma == pytest.approx(open_loop, rel=2e-3)
+        # what decays slowest is the axial motion, which keeps the arm's own drag alone
+        assert achieved.decay_per_s == pytest.approx(0.5 * DRAG / TIME, rel=1e-3)
+        assert achieved.optimum_gamma < achieved.gamma < achieved.open_loop_gamma
+
+
+def test_grids_converge_to_second_order() -> None:
+    """So that the extrapolated norm is worth more than the finest grid's."""
+    model = beam(MODES, DRAG)
+    damp = np.diag(np.repeat([-2.0, 0.0], MODES))
+    effort = np.hstack([-0.6 * np.eye(MODES), np.zeros((MODES, MODES))])
+    exact = norm(model.A + damp, model.B, np.vstack([model.C, effort]))
+    coarse, fine = verify_controller(arm(), straight(2.0), 0.3).gamma_by_grid
+    assert GRIDS[1] == 2 * GRIDS[0]
+    assert (coarse - exact) / (fine - exact) == pytest.approx(4.0, abs=1.0)
+
+
+def test_gain_of_the_wrong_sign() -> None:
+    achieved = verify_controller(arm(), straight(-2.0), 0.3)
+    assert achieved.gamma == math.inf
+    assert achieved.decay_per_s < 0.0
+
+
+def test_undamped_arm_has_no_finite_norm() -> None:
+    """The gains do not reach the axial motion, which goes on for ever."""
+    achieved = verify_observer(arm(0.0), straight(2.0), 0.3)
+    assert achieved.gamma == achieved.open_loop_gamma == math.inf
+    assert achieved.decay_per_s == 0.0
