@@ -18,7 +18,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import FuncFormatter
 
 from analysis.open_loop import THRESHOLD, EstimationErrors, compare_with_open_loop
 from analysis.recording import Recording, read_recording
@@ -152,11 +152,11 @@ def draw_estimation(
     """Estimation errors relative to their initial values, observer and open-loop model."""
     times = recording.times_s
     for errors, colour, name in (
-        (model, VERMILION, "open-loop model"),
+        (model, VERMILION, "open loop"),
         (observer, BLUE, "observer"),
     ):
         for course, norm, width, dashes in (
-            (errors.energy, "energy norm", 1.6, "-"),
+            (errors.energy, "energy", 1.6, "-"),
             (errors.shape, "shape", 1.0, (0, (4, 1.5))),
         ):
             ax.semilogy(
@@ -170,9 +170,10 @@ def draw_estimation(
             if course.below_1_percent_s is not None:
                 ax.plot(course.below_1_percent_s, THRESHOLD, "o", color=colour, markersize=6)
     ax.axhline(THRESHOLD, color=GREY, linewidth=0.9, linestyle=":")
-    ax.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=None))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda share, _: f"{100.0 * share:g}%"))
+    ax.set_ylim(top=20.0)  # room for the legend above the curves
     ax.set(xlabel="time [s]", ylabel="share of initial error", title="State estimation error")
-    ax.legend(frameon=False)
+    ax.legend(frameon=False, ncols=2, fontsize="small", loc="upper right", columnspacing=1.0)
     tidy(ax, times)
 
 
