@@ -309,7 +309,9 @@ def _print_summary(summary: dict[str, Any]) -> None:
 
 def _gammas(certificate: Certificate) -> dict[str, Any]:
     names = ("certified_gamma", "achieved_gamma", "open_loop_gamma", "optimum_gamma")
-    return {name: getattr(certificate, name) for name in (*names, "decay_per_s", "gain_norm", "seconds")}
+    return {
+        name: getattr(certificate, name) for name in (*names, "decay_per_s", "gain_norm", "seconds")
+    }
 
 
 def _print_deployment(table: dict[str, Any], deployment: Deployment) -> None:
