@@ -219,7 +219,12 @@ def _synthesise(
             "nothing was written. "
             "Try other weights, more damping or a less curved setpoint"
         )
-    exact = solve_gain(result.P, result.Z)
+    try:
+        exact = solve_gain(result.P, result.Z)
+    except ArithmeticError as error:
+        raise GainsRefusedError(
+            f"setpoint {name}, {role}: {error}; nothing was written. Try other weights or damping"
+        ) from None
     for tolerance in RANK_TOLERANCES:
         factors, dropped = factorise(exact, tolerance)
         eigenvalue = lpi_eigenvalue(problem, result.P, factors.operator(), result.gamma)

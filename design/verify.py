@@ -226,10 +226,13 @@ def riccati_optimum(A: Array, B1: Array, C1: Array, B2: Array, effort: float) ->
 
 def _reachable(A: Array, B1: Array, C1: Array, B2: Array, effort: float, gamma: float) -> bool:
     n = len(A)
-    quadratic = B1 @ B1.T / gamma**2 - B2 @ B2.T / effort**2
-    hamiltonian = np.block([[A, quadratic], [-C1.T @ C1, -A.T]])
+    drive, force, cost = B1 @ B1.T / gamma**2, B2 @ B2.T / effort**2, C1.T @ C1
+    size = np.linalg.norm(drive) + np.linalg.norm(force)
+    scale = np.sqrt(np.linalg.norm(cost) / size) if size > 0.0 and np.any(cost) else 1.0
+    # the solution is scaled so that the blocks are of one size
+    hamiltonian = np.block([[A, scale * (drive - force)], [-cost / scale, -A.T]])
     values = np.linalg.eigvals(hamiltonian)
-    if np.min(np.abs(values.real)) < 1e-9 * np.max(np.abs(values)):
+    if np.min(np.abs(values.real)) < _ON_THE_AXIS * np.max(np.abs(values)):
         return False
     _, vectors, stable = linalg.schur(hamiltonian, output="real", sort="lhp")
     if stable != n:

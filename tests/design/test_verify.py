@@ -131,6 +131,14 @@ def test_optimum_against_another_solver() -> None:
             assert got == pytest.approx(controller_optimum(model, effort), rel=2e-4)
 
 
+@pytest.mark.parametrize("effort", [1e-6, 1e-4, 1e4])
+def test_optimum_with_extreme_weights(effort: float) -> None:
+    """x_t = -x + v + u, z = (x, r u): the optimum is 1 / sqrt(1 + 1 / r^2)."""
+    one = np.ones((1, 1))
+    got = riccati_optimum(-one, one, one, one, effort)
+    assert got == pytest.approx(1.0 / math.sqrt(1.0 + effort**-2.0), rel=2e-4)
+
+
 def test_uncontrollable_growth_has_no_optimum() -> None:
     one, zero = np.ones((1, 1)), np.zeros((1, 1))
     assert riccati_optimum(one, one, one, zero, 1.0) == math.inf
