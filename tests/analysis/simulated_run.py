@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from closed_form import artefact
 
 from deploy import Deployment, deploy
 from node.sweep import NodeSweep
@@ -23,87 +24,20 @@ from plant.initial import initial_shape
 from plant.model import ArmPlant, PlantParameters
 from plant.noise import SensorNoise
 from recorder.writer import RecordingWriter
-from wire.artefact import (
-    Arm,
-    Certificate,
-    GainsArtefact,
-    OperatorFactors,
-    PolynomialMatrix,
-    Setpoint,
-    write_artefact,
-)
+from wire.artefact import GainsArtefact, write_artefact
 from wire.channels import FORMAT_VERSION, SHAPE_POINTS, label, node_channels, plant_channels
 from wire.messages import PLANT
 from wire.run_config import DisturbanceConfig, NoiseConfig, RunConfig, dumps
 
 Array = npt.NDArray[np.float64]
 
-ARM = Arm("test", 1.0, 0.025, 5e3, 1.1e3, 0.02)
 BYTES_PER_MESSAGE = 71
 """Made up: these recordings were never on a wire."""
 
 
-def constant(*rows: tuple[float, ...]) -> PolynomialMatrix:
-    return PolynomialMatrix([[[value] for value in row] for row in rows])
-
-
 def make_artefact(gain_per_s: float = 0.6) -> GainsArtefact:
-    """Setpoints "straight" and "bent" (kappa_e = 2 (1 - s)^2); the gains only take out energy."""
-    mass = ARM.mass_per_length_kg_per_m
-    observer = OperatorFactors(
-        n0=constant((0.0, 0.0), (-gain_per_s, 0.0), (0.0, 0.0), (0.0, -gain_per_s)),
-        n1a=constant((0.0,), (1e-3,), (0.0,), (0.0,)),
-        n1b=constant((0.0, 1.0)),
-        n2a=constant((0.0,), (1e-3,), (0.0,), (0.0,)),
-        n2b=constant((0.0, -1.0)),
-    )
-    controller = OperatorFactors(
-        n0=constant((0.0, -0.3 * mass, 0.0, 0.0)),
-        n1a=constant((0.02,)),
-        n1b=constant((0.0, 0.0, 0.0, 0.01)),
-        n2a=constant((0.02,)),
-        n2b=constant((0.0, 0.0, 0.0, 0.01)),
-    )
-    certificate = Certificate(
-        outcome="certified",
-        certified_gamma=0.1414,
-        achieved_gamma=0.135,
-        open_loop_gamma=2.33,
-        optimum_gamma=0.111,
-        decay_per_s=0.01,
-        gain_norm=14.1,
-        smallest_eigenvalue_p=1.0,
-        largest_eigenvalue_lpi=0.0,
-        equality_residual=0.0,
-        gram_sizes=[8],
-        equalities=0,
-        iterations=0,
-        solver="none",
-        solver_status="closed form",
-        seconds=0.0,
-    )
-    setpoints = []
-    for name, strength in (("straight", 0.0), ("bent", 2.0)):
-        # (1 - s)^2 = 1/3 P0 - 1/2 P1 + 1/6 P2 in x = 2 s - 1; the load -(EI kappa'/cos)' holds it.
-        curvature = [strength / 3.0, -strength / 2.0, strength / 6.0]
-        s = np.linspace(0.0, 1.0, 400)
-        angle = strength * (1.0 - (1.0 - s) ** 3) / 3.0
-        force = ARM.bending_stiffness_n_m2 * 2.0 * strength * (1.0 - s) / np.cos(angle)
-        series = np.polynomial.Legendre.fit(s, force, 12, domain=[0.0, 1.0])
-        setpoints.append(
-            Setpoint(
-                name=name,
-                curvature_per_m=curvature,
-                strain=[0.0],
-                feedforward_n_per_m=(-series.deriv()).coef.tolist(),
-                tip_m=[float(np.mean(np.cos(angle))), float(np.mean(np.sin(angle)))],
-                observer=observer,
-                controller=controller,
-                observer_certificate=certificate,
-                controller_certificate=certificate,
-            )
-        )
-    return GainsArtefact(ARM, {"noise": 0.1, "effort": 0.1}, setpoints, {"octarm": "test"})
+    """Setpoints "straight" and "bent" (kappa_e = 2 (1 - s)^2)."""
+    return artefact(gain_per_s=gain_per_s, coupling=0.02, name="bent", strength=2.0)
 
 
 @dataclass(frozen=True)

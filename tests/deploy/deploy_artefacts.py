@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+from closed_form import CERTIFICATE
 
 from wire.artefact import (
     Arm,
-    Certificate,
     GainsArtefact,
     OperatorFactors,
     PolynomialMatrix,
@@ -26,27 +26,6 @@ ARM = Arm(
 )
 CURVED = [0.9, -1.3, 0.5, 0.1, -0.2]
 STRAIGHT = [0.0]
-
-
-def certificate() -> Certificate:
-    return Certificate(
-        outcome="certified",
-        certified_gamma=1.0,
-        achieved_gamma=1.0,
-        open_loop_gamma=1.0,
-        optimum_gamma=1.0,
-        decay_per_s=1.0,
-        gain_norm=1.0,
-        smallest_eigenvalue_p=1.0,
-        largest_eigenvalue_lpi=0.0,
-        equality_residual=0.0,
-        gram_sizes=[1],
-        equalities=0,
-        iterations=0,
-        solver="none",
-        solver_status="made up for a test",
-        seconds=0.0,
-    )
 
 
 def operator(n0: Array, n1a: Array, n1b: Array, n2a: Array, n2b: Array) -> OperatorFactors:
@@ -119,8 +98,8 @@ def make_artefact(
             tip_m=[1.0, 0.1],
             observer=observer,
             controller=controller,
-            observer_certificate=certificate(),
-            controller_certificate=certificate(),
+            observer_certificate=CERTIFICATE,
+            controller_certificate=CERTIFICATE,
         )
         for i, (shape, (observer, controller)) in enumerate(zip(shapes, operators, strict=True))
     ]

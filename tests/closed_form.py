@@ -1,4 +1,4 @@
-"""Gains in closed form for the runtime's tests: they take out energy and need no solver."""
+"""Gains in closed form for tests: they only take out energy where they measure and act, no solver needed."""
 
 from __future__ import annotations
 
@@ -41,11 +41,16 @@ def constant(*rows: tuple[float, ...]) -> PolynomialMatrix:
     return PolynomialMatrix([[[value] for value in row] for row in rows])
 
 
-def artefact() -> GainsArtefact:
-    """Setpoints "straight" and "1", the latter with curvature (1 - s)^2 in 1/m."""
+def artefact(
+    gain_per_s: float = 0.5, coupling: float = 0.01, name: str = "1", strength: float = 1.0
+) -> GainsArtefact:
+    """Setpoints "straight" and `name`, the latter with curvature strength (1 - s)^2 in 1/m.
+
+    (1 - s)^2 = 1/3 P0 - 1/2 P1 + 1/6 P2 in x = 2 s - 1; the load -(EI kappa' / cos)' holds it.
+    """
     mass = ARM.mass_per_length_kg_per_m
     observer = OperatorFactors(
-        n0=constant((0.0, 0.0), (-0.5, 0.0), (0.0, 0.0), (0.0, -0.5)),
+        n0=constant((0.0, 0.0), (-gain_per_s, 0.0), (0.0, 0.0), (0.0, -gain_per_s)),
         n1a=constant((0.0,), (1e-3,), (0.0,), (0.0,)),
         n1b=constant((0.0, 1.0)),
         n2a=constant((0.0,), (1e-3,), (0.0,), (0.0,)),
@@ -53,20 +58,20 @@ def artefact() -> GainsArtefact:
     )
     controller = OperatorFactors(
         n0=constant((0.0, -0.3 * mass, 0.0, 0.0)),
-        n1a=constant((0.01,)),
+        n1a=constant((coupling,)),
         n1b=constant((0.0, 0.0, 0.0, 0.01)),
-        n2a=constant((0.01,)),
+        n2a=constant((coupling,)),
         n2b=constant((0.0, 0.0, 0.0, 0.01)),
     )
     s = np.linspace(0.0, 1.0, 400)
     setpoints = []
-    for name, bend in (("straight", 0.0), ("1", 1.0)):
+    for label, bend in (("straight", 0.0), (name, strength)):
         angle = bend * (1.0 - (1.0 - s) ** 3) / 3.0
         force = ARM.bending_stiffness_n_m2 * 2.0 * bend * (1.0 - s) / np.cos(angle)
-        series = np.polynomial.Legendre.fit(s, force, 10, domain=[0.0, 1.0])
+        series = np.polynomial.Legendre.fit(s, force, 12, domain=[0.0, 1.0])
         setpoints.append(
             Setpoint(
-                name=name,
+                name=label,
                 curvature_per_m=[bend / 3.0, -bend / 2.0, bend / 6.0],
                 strain=[0.0],
                 feedforward_n_per_m=(-series.deriv()).coef.tolist(),
