@@ -6,7 +6,6 @@ artefact (attached), the counters, and one channel per kind of message and node 
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +20,7 @@ from analysis.mcap_file import McapContent, read_mcap
 from analysis.table import Table, decode_table
 from deploy import Deployment, deploy
 from wire.artefact import FORMAT as GAINS_FORMAT
-from wire.artefact import GainsArtefact, read_artefact
+from wire.artefact import GainsArtefact, parse_artefact
 from wire.channels import (
     COMMAND,
     EVENTS,
@@ -34,7 +33,7 @@ from wire.channels import (
     SUMMARY,
     label,
 )
-from wire.errors import GainsRefusedError, UsageError
+from wire.errors import UsageError
 from wire.run_config import RunConfig, loads
 
 Array = npt.NDArray[np.float64]
@@ -265,14 +264,7 @@ def _artefact(content: McapContent, path: Path) -> GainsArtefact:
     for name, data in content.attachments.items():
         if f'"{GAINS_FORMAT}"'.encode() not in data[:200]:
             continue
-        with tempfile.TemporaryDirectory() as folder:
-            copy = Path(folder) / "attached"
-            copy.write_bytes(data)
-            try:
-                return read_artefact(copy)
-            except GainsRefusedError as error:
-                text = str(error).replace(str(copy), f"{name} attached to recording {path}")
-                raise GainsRefusedError(text) from None
+        return parse_artefact(data, f"{name} attached to recording {path}")
     attached = ", ".join(content.attachments) or "nothing"
     raise UsageError(
         f"recording {path}: expected the gains artefact attached, found {attached}; "
