@@ -33,6 +33,8 @@ MOST_TICKS = 1 << 18
 """The iteration ends here also, whatever the tick."""
 SAFELY = 0.1
 """It ends as soon as the error has been below this share of the threshold for a whole block."""
+BEYOND = 1e8
+"""An error that is this many times the first one does not come back."""
 _BLOCK = 128
 
 
@@ -86,8 +88,10 @@ def decay_time(
     for _ in range(0, most + 1, _BLOCK):
         share: Array = np.linalg.norm(block, axis=0)
         shares.append(share)
-        if not np.all(share < 1.0 / THRESHOLD**4) or np.all(share < SAFELY * threshold):
-            break  # it grows without bound, or is over
+        if not np.all(share < BEYOND):
+            return None
+        if np.all(share < SAFELY * threshold):
+            break
         block = power @ block
     course: Array = np.asarray(np.concatenate(shares), dtype=np.float64)
     times: Array = np.arange(course.size, dtype=np.float64) * tick_s

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter
 
-from analysis.open_loop import THRESHOLD, EstimationErrors, compare_with_open_loop
+from analysis.open_loop import THRESHOLD, ErrorCourse, EstimationErrors, compare_with_open_loop
 from analysis.recording import Recording, read_recording
 from wire.artefact import Setpoint
 from wire.errors import UsageError
@@ -151,30 +151,55 @@ def draw_estimation(
 ) -> None:
     """Estimation errors relative to their initial values, observer and open-loop model."""
     times = recording.times_s
-    for errors, colour, name in (
-        (model, VERMILION, "open loop"),
-        (observer, BLUE, "observer"),
+    both = ((observer, BLUE, "observer"), (model, VERMILION, "open loop"))
+    # The shape error swings widely from tick to tick: thin, and underneath.
+    for norm, width, dashes, opacity, fill in (
+        ("shape", 0.8, (0, (5, 1.5)), 0.7, "white"),
+        ("energy", 1.6, "-", 1.0, None),
     ):
-        for course, norm, width, dashes in (
-            (errors.energy, "energy", 1.6, "-"),
-            (errors.shape, "shape", 1.0, (0, (4, 1.5))),
-        ):
+        for errors, colour, name in both:
+            course: ErrorCourse = getattr(errors, norm)
             ax.semilogy(
                 times,
                 course.relative,
                 color=colour,
                 linewidth=width,
                 linestyle=dashes,
+                alpha=opacity,
                 label=f"{name}, {norm}",
             )
             if course.below_1_percent_s is not None:
-                ax.plot(course.below_1_percent_s, THRESHOLD, "o", color=colour, markersize=6)
+                ax.plot(
+                    course.below_1_percent_s,
+                    THRESHOLD,
+                    "o",
+                    color=colour,
+                    markerfacecolor=fill or colour,
+                    markersize=6,
+                    zorder=4,
+                )
     ax.axhline(THRESHOLD, color=GREY, linewidth=0.9, linestyle=":")
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda share, _: f"{100.0 * share:g}%"))
-    ax.set_ylim(top=20.0)  # room for the legend above the curves
+    ax.yaxis.set_major_formatter(FuncFormatter(_percent))
     ax.set(xlabel="time [s]", ylabel="share of initial error", title="State estimation error")
-    ax.legend(frameon=False, ncols=2, fontsize="small", loc="upper right", columnspacing=1.0)
+    ax.set_ylim(top=20.0 * ax.get_ylim()[1])  # room for the legend
+    order = [2, 3, 0, 1]  # energy in the first column
+    handles, labels = ax.get_legend_handles_labels()
+    ax.legend(
+        [handles[i] for i in order],
+        [labels[i] for i in order],
+        ncols=2,
+        loc="upper right",
+        frameon=False,
+        fontsize=8.5,
+        columnspacing=1.2,
+        handlelength=2.0,
+    )
     tidy(ax, times)
+
+
+def _percent(share: float, _: int | None) -> str:
+    """Label of a tick; none where the legend is."""
+    return f"{100.0 * share:g}%" if share < 5.0 else ""
 
 
 def draw_tip(ax: Any, recording: Recording) -> None:

@@ -1,5 +1,6 @@
 """What a run reports: every key with a plausible value, a table for a person, a picture."""
 
+import cmath
 import dataclasses
 import json
 import math
@@ -80,6 +81,49 @@ def test_the_estimation_error_is_the_energy_of_the_difference(path: Path) -> Non
         energy += 0.5 * arm.bending_stiffness_n_m2 * dual[3 - i] * k**2
     final = summarise(path)["estimation_error_root_joule"]["final"]
     assert final == pytest.approx(math.sqrt(energy), rel=1e-9)
+
+
+def test_the_shape_error_is_the_distance_of_the_shapes_and_counts_signs(path: Path) -> None:
+    """Each arm by hand as a chain of complex numbers, 4 equal segments, root's dual cell half."""
+    recording = read_recording(path)
+
+    def faces(states: np.ndarray) -> list[complex]:
+        places, angle = [0j], 0.0
+        for i, (_, _, strain, curvature) in enumerate(states):
+            angle += curvature * (0.125 if i == 0 else 0.25)
+            places.append(places[-1] + 0.25 * (1.0 + strain) * cmath.exp(1j * angle))
+        return places[1:]
+
+    def distance(estimate: np.ndarray, truth: np.ndarray) -> float:
+        pairs = zip(faces(estimate), faces(truth), strict=True)
+        return math.sqrt(sum(abs(a - b) ** 2 for a, b in pairs) / 4.0)
+
+    summary = summarise(path)
+    first, last = (distance(recording.estimates[k], recording.truth[k]) for k in (0, -1))
+    assert summary["shape_estimation_error_m"] == pytest.approx({"initial": first, "final": last})
+    assert summary["shape_estimation_error"] == pytest.approx(
+        {"initial": 1.0, "final": last / first}
+    )
+    for k in (0, 20):  # signs as the arm has them; 4 segments are coarse
+        tip = faces(recording.truth[k])[-1]
+        recorded = recording.of_plant("tip", ("x_m", "y_m"))[k]
+        assert recorded[1] > 0.2
+        assert [tip.real, tip.imag] == pytest.approx(recorded.tolist(), abs=0.12)
+
+
+def test_the_three_measures_of_the_estimation_have_their_times(path: Path) -> None:
+    """Without correction only drag, 0.01/s on average, takes the error away: ln(100)/0.01 = 461 s."""
+    summary = summarise(path)
+    assert summary["shape_below_1_percent_s"]["open_loop_model"] is None
+    # The shape error swings with the first mode (37 s), so 24 s give no rate to extrapolate by.
+    assert summary["shape_below_1_percent_extrapolated_s"] == {"open_loop_model": None}
+    linear = summary["linear_model_below_1_percent_s"]
+    assert linear["open_loop_model"] == pytest.approx(461.0, rel=0.15)
+    assert 0.0 < linear["observer"] < 0.5 * linear["open_loop_model"]
+    text = render(summary)
+    assert "energy norm; open-loop model" in text
+    assert "rms distance of estimated from true arm" in text
+    assert f"{linear['observer']:.3g} s" in text
 
 
 def test_the_table_says_it_in_words_and_units(path: Path) -> None:
