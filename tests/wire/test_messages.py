@@ -145,10 +145,31 @@ def test_no_input_does_anything_but_decode_or_be_refused(raw: bytes) -> None:
         lambda: decode_batch(raw, RUN, {2: 4}),
         lambda: decode_counters(raw, RUN),
         lambda: decode_stop(raw, RUN),
-        lambda: kind_of(raw),
     ):
         with pytest.raises(RejectedError):
             decode()
+
+
+@given(st.binary(max_size=200) | anything.map(msgpack.packb))
+def test_only_seven_fields_with_a_known_kind_have_one(raw: bytes) -> None:
+    """`kind_of` looks at nothing else: seven zeros with a 1 in second place do have a kind."""
+    try:
+        fields = msgpack.unpackb(raw)
+    except (ValueError, TypeError, RecursionError, msgpack.UnpackException):
+        fields = None
+    known = isinstance(fields, list) and len(fields) == 7 and fields[1] in list(Kind)
+    if known:
+        assert kind_of(raw) is Kind(fields[1])
+    else:
+        with pytest.raises(RejectedError):
+            kind_of(raw)
+
+
+def test_a_kind_is_read_without_checking_the_rest() -> None:
+    raw = b"\x97\x00\x01\x00\x00\x00\x00\x00"
+    assert kind_of(raw) is Kind(1)
+    with pytest.raises(RejectedError):
+        decode_numbers(raw, Kind(1), RUN, 2, [3])
 
 
 @given(st.lists(anything, min_size=7, max_size=7))
