@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 
+from supervise.shipped import DEFAULT_ARM, DEFAULT_GAINS
 from wire.errors import ExitCode, OctarmError, UsageError
 
 if TYPE_CHECKING:
@@ -26,9 +27,6 @@ if TYPE_CHECKING:
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 Ints = Annotated[tuple[int, ...], tyro.conf.UseAppendAction]
-EXAMPLES = Path(__file__).resolve().parent / "examples"
-DEFAULT_GAINS = EXAMPLES / "default.gains.json"
-DEFAULT_ARM = EXAMPLES / "chapter_arm.toml"
 
 
 def run(

@@ -86,15 +86,14 @@ RESIDUAL_TOLERANCE = 1e-6
 EIGENVALUE_TOLERANCE = 1e-5
 
 
-class _Rows:
-    """All rows on xi = (z, w | f, w_y) that the program needs."""
+class _Signals:
+    """What the LPI speaks of, as operators on xi = (z, w | f, w_y)."""
 
-    def __init__(self, problem: HinfProblem, level: int) -> None:
+    def __init__(self, problem: HinfProblem) -> None:
         n = problem.T.shape_out.functions
         nz, nw = problem.C1.shape_out.finite, problem.B.shape_in.finite
         ny = problem.C2.shape_out.functions
-        space = Shape(nz + nw, n + ny)
-        eye = PIOperator.identity(space)
+        eye = PIOperator.identity(Shape(nz + nw, n + ny))
         f = eye.rows([], range(n))
         w = eye.rows(range(nz, nz + nw), [])
         self.noise = eye.rows([], range(n, n + ny))
@@ -104,6 +103,14 @@ class _Rows:
         self.x_t = problem.A @ f - problem.B @ w
         self.y = problem.C2 @ self.x - self.noise * problem.rho
         self.c1 = lifted(problem.C1 @ self.x)
+        self.channels = vertical(self.z, self.w, self.noise)
+
+
+class _Rows:
+    """The rows of the Gram forms: of P and of Z on the state, of the inequality on xi."""
+
+    def __init__(self, problem: HinfProblem, signals: _Signals, level: int) -> None:
+        n = problem.T.shape_out.functions
         state = PIOperator.identity(Shape(0, n))
         ladder, profiles = [state], []
         for _ in range(level):
@@ -117,25 +124,24 @@ class _Rows:
             unit_rows(ladder[-1].rows([], half) if level else state),
         )
         columns = [c for p in profiles for row in p.q2 for c in row if np.any(c)]
-        self.profiles = function_span(columns)
         integrals = PIOperator.zeros(Shape(n, 0), Shape(0, n)).replace(q1=np.eye(n)[:, :, None])
         self.inequality = vertical(
-            self.z,
-            *(weighted(self.w, profile) for profile in self.profiles),
-            lifted(integrals @ self.x),
-            self.gain @ self.x,
-            self.noise,
+            signals.z,
+            *(weighted(signals.w, profile) for profile in function_span(columns)),
+            lifted(integrals @ signals.x),
+            self.gain @ signals.x,
+            signals.noise,
         )
 
 
-def _tables(rows: _Rows) -> tuple[list[FormTable], Layout]:
+def _tables(signals: _Signals, rows: _Rows) -> tuple[list[FormTable], Layout]:
     """Columns (constant, gamma, delta, Z, Gram of P, Gram of the inequality)."""
-    channels = vertical(rows.z, rows.w, rows.noise)
-    constant = forms(rows.z, rows.c1).trace()
-    gamma = forms(channels, channels).trace() * -0.5
-    delta = forms(rows.x, rows.x_t).trace()
-    z = forms(rows.gain @ rows.x, rows.y)
-    lyapunov = forms(rows.lyapunov @ rows.x, rows.lyapunov @ rows.x_t).symmetric().upper(0.5)
+    x, x_t = signals.x, signals.x_t
+    constant = forms(signals.z, signals.c1).trace()
+    gamma = forms(signals.channels, signals.channels).trace() * -0.5
+    delta = forms(x, x_t).trace()
+    z = forms(rows.gain @ x, signals.y)
+    lyapunov = forms(rows.lyapunov @ x, rows.lyapunov @ x_t).symmetric().upper(0.5)
     inequality = forms(rows.inequality, rows.inequality).upper(0.5)
     layout = Layout(
         numbers=("gamma", "delta"),
@@ -164,8 +170,9 @@ def solve_hinf(
     """
     stages = stages or Stages()
     start = time.perf_counter()
-    rows = _Rows(problem, level)
-    tables, layout = _tables(rows)
+    signals = _Signals(problem)
+    rows = _Rows(problem, signals, level)
+    tables, layout = _tables(signals, rows)
     program = Program(coefficient_matrix(tables), layout)
     sizes = tuple(k for _, k in layout.grams)
     progress(f"{program.equalities} equalities, Gram matrices {sizes}")
@@ -222,13 +229,12 @@ def lpi_eigenvalue(
     `size`; it does not use the Gram matrices. Not positive: gamma is certified for this very gain, also
     after its ranks were cut.
     """
-    rows = _Rows(problem, 0)
-    channels = vertical(rows.z, rows.w, rows.noise)
-    half = rows.x.adjoint @ (P @ (rows.x_t + gain @ rows.y)) + rows.z.adjoint @ rows.c1
-    half = half - (channels.adjoint @ channels) * (0.5 * gamma)
+    s = _Signals(problem)
+    half = s.x.adjoint @ (P @ (s.x_t + gain @ s.y)) + s.z.adjoint @ s.c1
+    half = half - (s.channels.adjoint @ s.channels) * (0.5 * gamma)
     matrix = half.discretise(size)
     n = problem.T.shape_out.functions * size
-    finite = rows.x.shape_in.finite
+    finite = s.x.shape_in.finite
     weight = np.eye(len(matrix))
     T = problem.T.discretise(size, size + 12)
     weight[finite : finite + n, finite : finite + n] = T.T @ T

@@ -1,7 +1,7 @@
 """The semidefinite programs: Gram matrices and free numbers under linear equalities, solved by CVXPY.
 
-The equalities are scaled and orthonormalised before a solver sees them, a strictly feasible point is looked
-for first, and whatever the solver says is recomputed from its numbers (theory, section 3).
+The equalities are scaled and orthonormalised before a solver sees them, and whatever the solver says is
+recomputed from its numbers (theory, section 3).
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from time import monotonic
 import psutil
 
 from supervise.endpoints import HIGHEST_FREE_PORT, choose
-from supervise.plan import DEFAULT_GAINS
+from supervise.shipped import DEFAULT_GAINS
 from wire.artefact import read_artefact
 from wire.errors import OctarmError
 from wire.session import control_publisher, direct, matched, open_session

@@ -25,6 +25,7 @@ from plant.initial import check_name
 from plant.noise import SensorNoise
 from supervise.endpoints import Endpoints
 from supervise.factors_file import factors_json
+from supervise.shipped import DEFAULT_GAINS
 from wire.artefact import GainsArtefact, digest, read_artefact
 from wire.channels import FORMAT_VERSION
 from wire.errors import UsageError
@@ -45,7 +46,6 @@ MOST_NODES = 1000
 CORES = 2
 """Two sweeps run towards each other; more cores would only add wake-ups across cores (runtime
 figures)."""
-DEFAULT_GAINS = Path(__file__).resolve().parent.parent / "examples" / "default.gains.json"
 
 
 @dataclass(frozen=True)

@@ -43,9 +43,3 @@ class StartUpTimeoutError(OctarmError):
     """Some process or link was not there in time; the message names which."""
 
     exit_code = ExitCode.START_UP_TIMEOUT
-
-
-class SafetyStopError(OctarmError):
-    """A run that was stopped because a process died or a number was not finite."""
-
-    exit_code = ExitCode.SAFETY_STOP
