@@ -1,156 +1,76 @@
-"""PDEs as data evaluated with numpy.polynomial: shares no code with the conversions under test.
+"""Values of a problem file's expressions where states and inputs are given polynomials, by numpy.polynomial only.
 
-States are (X, functions): a number for an ode state and a numpy Polynomial for a function of s, in the order of
-the PDE's states. Short names build expressions: d(i, j) is d^j x_i / ds^j.
+`Sample` holds them in the file's own coordinate s; `value` takes an expression of the model, which lives on
+[0, 1], and maps as the model promises: states keep their values, distributed signals are multiplied by sqrt(b - a).
 """
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
-from numpy.polynomial import Polynomial as Poly
+from numpy.polynomial import Polynomial
 
-from design.pde.model import (
-    Atom,
-    Expression,
-    Field,
-    Input,
-    InputIntegral,
-    Integral,
-    Kind,
-    Output,
-    Pde,
-    Point,
-    Signal,
-    StateVariable,
-)
+from design.pde.model import Expression, Field, Input, InputIntegral, Integral, Kind, Point
 
-Array = npt.NDArray[np.float64]
-Value = float | Poly
-Term = tuple[Atom, tuple[float, ...]]
+Quantity = Polynomial | float
 
 
-def d(state: int, derivative: int = 0, *weight: float) -> Term:
-    return Field(state, derivative), weight or (1.0,)
+@dataclass(frozen=True)
+class Sample:
+    """States and inputs, in the order of the problem; polynomials in s, or numbers."""
+
+    domain: tuple[float, float]
+    states: tuple[Quantity, ...]
+    disturbances: tuple[Quantity, ...] = ()
+    controls: tuple[Quantity, ...] = ()
+
+    @property
+    def length(self) -> float:
+        return self.domain[1] - self.domain[0]
+
+    def on_unit(self, quantity: Quantity) -> Polynomial:
+        """As a function of sigma, s = a + l sigma."""
+        if isinstance(quantity, Polynomial):
+            return quantity(Polynomial([self.domain[0], self.length]))
+        return Polynomial([quantity])
+
+    def input(self, kind: Kind, index: int) -> Polynomial:
+        quantity = (self.disturbances if kind is Kind.DISTURBANCE else self.controls)[index]
+        scale = math.sqrt(self.length) if isinstance(quantity, Polynomial) else 1.0
+        return self.on_unit(quantity) * scale
 
 
-def at(state: int, derivative: int, end: int, *weight: float) -> Term:
-    return Point(state, derivative, end), weight or (1.0,)
+def integral(function: Polynomial, low: float = 0.0, high: float = 1.0) -> float:
+    primitive = function.integ()
+    return float(primitive(high) - primitive(low))
 
 
-def integral(state: int, derivative: int, inside: Sequence[float], *weight: float) -> Term:
-    return Integral(state, derivative, tuple(inside)), weight or (1.0,)
+def value(expression: Expression, sample: Sample) -> tuple[Polynomial, float]:
+    """The expression as a polynomial on [0, 1], and the size of its largest term there."""
+    total, size = Polynomial([0.0]), 0.0
+    for atom, coefficient in expression.terms:
+        match atom:
+            case Field(state, derivative):
+                factor = sample.on_unit(sample.states[state]).deriv(derivative)
+            case Point(state, derivative, end):
+                at = sample.on_unit(sample.states[state]).deriv(derivative)(float(end))
+                factor = Polynomial([at])
+            case Integral(state, derivative, weight):
+                function = sample.on_unit(sample.states[state]).deriv(derivative)
+                factor = Polynomial([integral(Polynomial(weight) * function)])
+            case Input(kind, index):
+                factor = sample.input(kind, index)
+            case InputIntegral(kind, index, weight):
+                factor = Polynomial([integral(Polynomial(weight) * sample.input(kind, index))])
+        term = Polynomial(coefficient) * factor
+        total = total + term
+        size = max(size, float(np.abs(term.coef).sum()))
+    return total, size
 
 
-def w(index: int, *weight: float) -> Term:
-    return Input(Kind.DISTURBANCE, index), weight or (1.0,)
-
-
-def u(index: int, *weight: float) -> Term:
-    return Input(Kind.CONTROL, index), weight or (1.0,)
-
-
-def int_w(index: int, inside: Sequence[float], *weight: float) -> Term:
-    return InputIntegral(Kind.DISTURBANCE, index, tuple(inside)), weight or (1.0,)
-
-
-def int_u(index: int, inside: Sequence[float], *weight: float) -> Term:
-    return InputIntegral(Kind.CONTROL, index, tuple(inside)), weight or (1.0,)
-
-
-def sum_of(*terms: Term) -> Expression:
-    return Expression(terms, " + ".join(f"{weight}*{atom}" for atom, weight in terms))
-
-
-def scalar(*terms: Term) -> Output:
-    return Output(sum_of(*terms), distributed=False)
-
-
-def distributed(*terms: Term) -> Output:
-    return Output(sum_of(*terms), distributed=True)
-
-
-def states(*orders: int | None) -> tuple[StateVariable, ...]:
-    return tuple(StateVariable(f"x{i}", order) for i, order in enumerate(orders))
-
-
-def signals(*distributed: bool) -> tuple[Signal, ...]:
-    return tuple(Signal(f"v{i}", flag) for i, flag in enumerate(distributed))
-
-
-def definite(function: Poly) -> float:
-    return float(function.integ()(1.0))
-
-
-def value(
-    atom: Atom, x: Sequence[Value], disturbances: Sequence[Value], controls: Sequence[Value]
-) -> Value:
-    match atom:
-        case Field(state, derivative):
-            inside = x[state]
-            return inside.deriv(derivative) if isinstance(inside, Poly) else inside
-        case Point(state, derivative, end):
-            inside = x[state]
-            return float(
-                (inside if isinstance(inside, Poly) else Poly([inside])).deriv(derivative)(end)
-            )
-        case Integral(state, derivative, weight):
-            inside = x[state]
-            return definite(
-                Poly(weight) * (inside.deriv(derivative) if isinstance(inside, Poly) else inside)
-            )
-        case Input(kind, index):
-            return (disturbances if kind is Kind.DISTURBANCE else controls)[index]
-        case InputIntegral(kind, index, weight):
-            return definite(
-                Poly(weight) * (disturbances if kind is Kind.DISTURBANCE else controls)[index]
-            )
-
-
-def evaluate(
-    expression: Expression,
-    x: Sequence[Value],
-    disturbances: Sequence[Value] = (),
-    controls: Sequence[Value] = (),
-) -> Poly:
-    """The expression as a function of s (a constant one if it is a number)."""
-    total = Poly([0.0])
-    for atom, weight in expression.terms:
-        total = total + Poly(weight) * value(atom, x, disturbances, controls)
-    return total
-
-
-def random_signals(group: Sequence[Signal], rng: np.random.Generator) -> list[Value]:
-    return [Poly(rng.normal(size=4)) if s.distributed else float(rng.normal()) for s in group]
-
-
-def random_states(
-    pde: Pde, rng: np.random.Generator, degree: int = 9, count: int = 1
-) -> list[list[Value]]:
-    """States that meet the conditions: random elements of the null space of the conditions on polynomials."""
-    units: list[list[Value]] = []
-    for i, state in enumerate(pde.states):
-        for power in range(1 if state.order is None else degree + 1):
-            one: list[Value] = [0.0 if s.order is None else Poly([0.0]) for s in pde.states]
-            one[i] = 1.0 if state.order is None else Poly([-1.0, 2.0]) ** power
-            units.append(one)
-    rows = np.array([[evaluate(c, x)(0.0) for x in units] for c in pde.conditions]).reshape(
-        -1, len(units)
-    )
-    _, sizes, vt = np.linalg.svd(rows)
-    basis = vt[int(np.sum(sizes > 1e-10 * max(sizes, default=1.0))) :]
-    out = []
-    for _ in range(count):
-        mixed = rng.normal(size=len(basis)) @ basis
-        out.append(
-            [
-                sum((c * x[i] for c, x in zip(mixed, units, strict=True)), start=0.0 * units[0][i])
-                for i in range(len(pde.states))
-            ]
-        )
-    return out
-
-
-def inner(x: Sequence[Value], y: Sequence[Value]) -> float:
-    """In R^m x L2^n."""
-    return sum(definite(Poly([1.0]) * a * b) for a, b in zip(x, y, strict=True))
+def distance(left: Polynomial, right: Polynomial) -> float:
+    """Largest difference on [0, 1]."""
+    points = np.linspace(0.0, 1.0, 23)
+    return float(np.abs(left(points) - right(points)).max())
