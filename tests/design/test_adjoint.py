@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 import pytest
-from pde_reference import (
+from pde_polynomials import (
     Term,
     Value,
     at,

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from numpy.polynomial import Polynomial as Poly
-from pde_reference import (
+from pde_polynomials import (
     Value,
     at,
     d,
