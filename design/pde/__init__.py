@@ -1,0 +1,1 @@
+"""Linear partial differential equations in one space dimension: read, converted to PIEs, discretised."""
