@@ -1,7 +1,7 @@
-"""Values of a problem file's expressions where states and inputs are given polynomials, by numpy.polynomial only.
+"""Expressions of problem files where states and inputs are given polynomials, by numpy.polynomial only.
 
-`Sample` holds them in the file's own coordinate s; `value` takes an expression of the model, which lives on
-[0, 1], and maps as the model promises: states keep their values, distributed signals are multiplied by sqrt(b - a).
+`Sample` holds the polynomials in the file's own coordinate s; `value` takes an expression of the model, which
+lives on [0, 1], where states keep their values and distributed signals are multiplied by sqrt(b - a).
 """
 
 from __future__ import annotations
