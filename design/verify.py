@@ -10,86 +10,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg
-from scipy.optimize import minimize_scalar
 
 from deploy.grid import COMMAND_PLACES, MEASUREMENT_PLACES, STATE_PLACES, make_grid
 from deploy.step import make_loop
 from design.arm_file import time_unit_s
+from design.channel import Channel, riccati_optimum
 from wire.artefact import Arm, Setpoint
 
 Array = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
 
 GRIDS = (40, 80)
 """Segments of the two grids; the norms at both give the extrapolated value (second order)."""
 RICCATI_GRID = 16
-_ON_THE_AXIS = 1e-12
-"""Real parts below this share of the largest eigenvalue are rounding: such a mode does not decay."""
-PEAKS = 5
-"""Local maxima of the sweep that are refined, the highest ones."""
-FREQUENCIES = np.concatenate([[0.0], np.geomspace(1e-2, 1e3, 120)])
-
-
-@dataclass(frozen=True)
-class Channel:
-    """x_t = A x + B w, z = C x + D w, nondimensional and in coordinates where norms are Euclidean."""
-
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-
-    @cached_property
-    def _schur(self) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Triangular T, and input and output matrix in its coordinates: a frequency costs one sweep."""
-        T, Q = linalg.schur(self.A.astype(np.complex128), output="complex")
-        return T, Q.conj().T @ self.B, self.C @ Q
-
-    def norm_at(self, omega: float) -> float:
-        """Largest singular value of the transfer function at i omega."""
-        T, B, C = self._schur
-        shifted = 1j * omega * np.eye(len(T)) - T
-        response = C @ linalg.solve_triangular(shifted, B, check_finite=False) + self.D
-        return float(np.linalg.norm(response, 2))
-
-    def hinf_norm(self) -> float:
-        """H-infinity norm by a sweep over frequencies and a refinement at the highest peaks.
-
-        The sweep visits the frequency of every eigenvalue and the flanks of its resonance, so that no
-        peak is too narrow for it. Infinite unless all modes of A decay: the sweep would otherwise return
-        a finite number.
-        """
-        if self.decay() <= 0.0:
-            return float("inf")
-        poles = np.diag(self._schur[0])
-        resonances = [np.abs(poles.imag) + k * np.abs(poles.real) for k in (-1.0, 0.0, 1.0)]
-        sweep = np.unique(np.concatenate([FREQUENCIES, *resonances]).clip(0.0))
-        sweep = sweep[np.append(True, np.diff(sweep) > 1e-8 * sweep[1:])]  # equal but for rounding
-        values = np.array([self.norm_at(w) for w in sweep])
-        padded = np.concatenate([[-np.inf], values, [-np.inf]])
-        peaks = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]))
-        best = float(values.max())
-        for k in peaks[np.argsort(values[peaks])[-PEAKS:]]:
-            low, high = sweep[max(k - 1, 0)], sweep[min(k + 1, len(sweep) - 1)]
-            found = minimize_scalar(
-                lambda w: -self.norm_at(w),
-                bounds=(low, high),
-                method="bounded",
-                options={"xatol": 1e-6 * high},
-            )
-            best = max(best, -float(found.fun))
-        return best
-
-    def decay(self) -> float:
-        """Minus the largest real part of the eigenvalues of A; zero where it is no more than rounding."""
-        values = np.diag(self._schur[0])
-        slowest = -float(values.real.max())
-        return slowest if abs(slowest) > _ON_THE_AXIS * np.abs(values).max() else 0.0
 
 
 @dataclass(frozen=True)
@@ -206,40 +141,3 @@ def _verify(
         optimum_gamma=optimum(_plant(arm, setpoint, RICCATI_GRID)),
         decay_per_s=min(c.decay() for c in closed) / time_unit_s(arm),
     )
-
-
-def riccati_optimum(A: Array, B1: Array, C1: Array, B2: Array, effort: float) -> float:
-    """Infimum of gamma for x_t = A x + B1 w + B2 u, z = (C1 x, effort u), by bisection to 1e-4 relative.
-
-    A gamma is reachable by state feedback iff the game Riccati equation has a stabilising X >= 0.
-    """
-    low, high = 0.0, 1.0
-    while not _reachable(A, B1, C1, B2, effort, high):
-        low, high = high, 2.0 * high
-        if high > 1e6:
-            return float("inf")
-    while high - low > 1e-4 * high:
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if _reachable(A, B1, C1, B2, effort, middle) else (middle, high)
-    return high
-
-
-def _reachable(A: Array, B1: Array, C1: Array, B2: Array, effort: float, gamma: float) -> bool:
-    n = len(A)
-    drive, force, cost = B1 @ B1.T / gamma**2, B2 @ B2.T / effort**2, C1.T @ C1
-    size = np.linalg.norm(drive) + np.linalg.norm(force)
-    scale = np.sqrt(np.linalg.norm(cost) / size) if size > 0.0 and np.any(cost) else 1.0
-    # the solution is scaled so that the blocks are of one size
-    hamiltonian = np.block([[A, scale * (drive - force)], [-cost / scale, -A.T]])
-    values = np.linalg.eigvals(hamiltonian)
-    if np.min(np.abs(values.real)) < _ON_THE_AXIS * np.max(np.abs(values)):
-        return False
-    _, vectors, stable = linalg.schur(hamiltonian, output="real", sort="lhp")
-    if stable != n:
-        return False
-    upper, lower = vectors[:n, :n], vectors[n:, :n]
-    if np.linalg.cond(upper) > 1e14:
-        return False
-    solution = np.linalg.solve(upper.T, lower.T).T
-    eigenvalues = np.linalg.eigvalsh(0.5 * (solution + solution.T))
-    return bool(eigenvalues[0] >= -1e-8 * max(abs(eigenvalues[-1]), 1e-300))
