@@ -85,14 +85,8 @@ class Program:
             )
         self.layout = layout
         self._matrix = matrix
-        norms = np.linalg.norm(matrix, axis=1)
-        scaled = matrix / np.maximum(norms, ROW_FLOOR * norms.max())[:, None]
-        reduced = np.linalg.qr(scaled, mode="r") if len(scaled) > scaled.shape[1] else scaled
-        _, values, rows = np.linalg.svd(reduced, full_matrices=False)
-        rank = int(np.count_nonzero(values > RANK_TOLERANCE * values[0]))
-        self.equalities = rank
-        self.singular_values = values
-        self._rows = rows[:rank]
+        self._rows = orthonormal_equalities(matrix)
+        self.equalities = len(self._rows)
 
     def _variables(
         self,
@@ -166,6 +160,15 @@ class Program:
             seconds=seconds,
             equalities=self.equalities,
         )
+
+
+def orthonormal_equalities(matrix: Array) -> Array:
+    """An orthonormal basis of the matrix's row space, rows scaled first; rounding is no equality."""
+    norms = np.linalg.norm(matrix, axis=1)
+    scaled = matrix / np.maximum(norms, ROW_FLOOR * norms.max())[:, None]
+    reduced = np.linalg.qr(scaled, mode="r") if len(scaled) > scaled.shape[1] else scaled
+    _, values, rows = np.linalg.svd(reduced, full_matrices=False)
+    return np.asarray(rows[: int(np.count_nonzero(values > RANK_TOLERANCE * values[0]))])
 
 
 def _relative_smallest(gram: Array) -> float:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 class Status(StrEnum):
     """CERTIFIED: proven, to rounding, and confirmed on an independent discretisation. INFEASIBLE: shown to be
-    impossible (an unstable eigenvalue, or the solver's certificate). UNRELIABLE: neither; the message says why."""
+    impossible (an eigenvalue grows, no gain can help). UNRELIABLE: neither; the message says why."""
 
     CERTIFIED = "certified"
     INFEASIBLE = "infeasible"

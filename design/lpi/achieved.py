@@ -1,0 +1,96 @@
+"""The same quantity on matrices that share no code with the LPI: what stands beside every certified number."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from design.lpi.gains import Gain
+from design.lpi.result import Achieved
+from design.pde.evidence import (
+    Refined,
+    controller_optimum,
+    feedback_loop,
+    observer_loop,
+    observer_optimum,
+    refine,
+)
+from design.pde.galerkin import System, discretise, norm_ratio
+from design.pde.model import Pde
+
+TOLERANCE = 1e-6
+"""Relative agreement of the last two sizes."""
+_OPTIMUM_SIZE = 23
+
+
+class Verification:
+    """Discretisations of one PDE, made once and kept."""
+
+    def __init__(self, pde: Pde, seconds: float = 60.0) -> None:
+        self.pde = pde
+        self.seconds = seconds
+        self._systems: dict[int, System] = {}
+
+    def system(self, size: int) -> System:
+        """The matrices of this size. Raises ValueError if the PDE cannot be discretised."""
+        if size not in self._systems:
+            self._systems[size] = discretise(self.pde, size)
+        return self._systems[size]
+
+    def abscissa(self) -> float:
+        """Largest real part of the eigenvalues at the optimum's size."""
+        return self.system(_OPTIMUM_SIZE).abscissa()
+
+    def unstable(self) -> bool:
+        """Whether two sizes agree that a resolved mode grows."""
+        pair = [self.system(size) for size in (15, _OPTIMUM_SIZE)]
+        return all(s.grows() and not s.undecided() for s in pair)
+
+    def slowest_rate(self) -> float:
+        """A rate of the slow dynamics: the decay, or a tenth of the smallest eigenvalue if that is larger."""
+        values = self.system(15).eigenvalues
+        magnitudes = [float(abs(v)) for v in values if abs(v) > 1e-9]
+        return max(-float(values.real.max()), 0.1 * min(magnitudes, default=1.0), 1e-6)
+
+    def open_loop(self) -> Achieved:
+        """The H-infinity norm without any gain."""
+        return _achieved(self._refined(lambda s: s.gain()))
+
+    def norm(self) -> Achieved:
+        """The largest quotient |numerator| / |denominator|."""
+        return _achieved(refine(lambda n: norm_ratio(self.pde, n), tolerance=TOLERANCE))
+
+    def loop(self, gain: Gain) -> Achieved:
+        """The H-infinity norm with the gain, beside that without and the best that any gain could reach."""
+
+        def norm(system: System) -> float:
+            operator = gain.operator
+            if gain.role == "observer":
+                return observer_loop(
+                    system, operator.discretise(system.size, system.rows)
+                ).hinf_norm()
+            return feedback_loop(system, operator.discretise(system.rows, system.size)).hinf_norm()
+
+        return _achieved(
+            self._refined(norm), self.system(_OPTIMUM_SIZE).gain(), self.optimum(gain.role)
+        )
+
+    def optimum(self, role: str) -> float | None:
+        """The infimum of gamma over all gains, None where no Riccati equation gives it."""
+        of = observer_optimum if role == "observer" else controller_optimum
+        return of(self.system(_OPTIMUM_SIZE)).value
+
+    def _refined(self, figure: Callable[[System], float]) -> Refined:
+        return refine(lambda n: figure(self.system(n)), tolerance=TOLERANCE, seconds=self.seconds)
+
+
+def _achieved(
+    refined: Refined, open_loop: float | None = None, optimum: float | None = None
+) -> Achieved:
+    return Achieved(
+        value=refined.value,
+        by_size=tuple(zip(refined.sizes, refined.values, strict=True)),
+        converged=refined.converged and math.isfinite(refined.value),
+        open_loop=open_loop,
+        optimum=optimum,
+    )
