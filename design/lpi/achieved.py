@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
+
 from design.lpi.gains import Gain
 from design.lpi.result import Achieved
 from design.pde.evidence import (
@@ -69,7 +71,12 @@ class Verification:
                 return observer_loop(
                     system, operator.discretise(system.size, system.rows)
                 ).hinf_norm()
-            return feedback_loop(system, operator.discretise(system.rows, system.size)).hinf_norm()
+            if gain.fundamental is None:
+                K = operator.discretise(system.rows, system.size)
+            else:  # the f that belongs to the discretised x
+                to_state = gain.fundamental.discretise(system.size, system.rows)
+                K = operator.discretise(system.size) @ np.linalg.pinv(to_state)
+            return feedback_loop(system, K).hinf_norm()
 
         return _achieved(
             self._refined(norm), self.system(_OPTIMUM_SIZE).gain(), self.optimum(gain.role)

@@ -16,10 +16,12 @@ import numpy as np
 
 from design.lpi.achieved import Verification
 from design.lpi.bisection import bisect_stability
+from design.lpi.dual import dual_pie, dual_structure
 from design.lpi.gains import Gain, gain_operator
 from design.lpi.inequality import Certificate, Inequality, dissipated_ends
 from design.lpi.norm import NormInequality
 from design.lpi.result import Achieved, Attempt, Options, Progress, Result, Status, silent
+from design.lpi.rows import Structure, structure
 from design.lpi.scaling import scaled
 from design.lpi.sdp import Point
 from design.lpi.search import (
@@ -29,8 +31,9 @@ from design.lpi.search import (
     make_attempt,
     solve_ladder,
 )
+from design.operators import PIOperator
 from design.pde.adjoint import NotAdjointable, dual_system
-from design.pde.convert import convert
+from design.pde.convert import Pie, convert
 from design.pde.model import Pde
 
 DELTA = 1e-3
@@ -72,45 +75,52 @@ def _gain(pde: Pde, options: Options, progress: Progress) -> Result:
         return _unstable("gain", check)
     open_loop = check.open_loop()
     search = Search(options, progress, lower=_finite(open_loop.value))
-    _attempts(pde, search, measured=False, rate=check.slowest_rate())
+    pie = convert(pde)
+    _attempts(pie, structure(pie), search, measured=False, rate=check.slowest_rate())
     return _bound("gain", search, open_loop, "bounded real lemma")
 
 
 def _observer(pde: Pde, options: Options, progress: Progress) -> Result:
     check = Verification(pde)
     search = Search(options, progress, lower=_finite(check.optimum("observer")))
-    _attempts(pde, search, measured=True, rate=check.slowest_rate())
+    pie = convert(pde)
+    _attempts(pie, structure(pie), search, measured=True, rate=check.slowest_rate())
     gain, achieved = _gain_of(search, "observer", check)
     return _bound("observer", search, achieved, "observer LPI", gain)
 
 
 def _controller(pde: Pde, options: Options, progress: Progress) -> Result:
     check = Verification(pde)
-    try:
-        dual = dual_system(pde)
-    except NotAdjointable as reason:
-        return Result(
-            task="controller",
-            status=Status.UNRELIABLE,
-            message=f"no formulation: the state feedback is designed as the observer of the adjoint system, "
-            f"and {reason}",
-            formulation="none",
-        )
     search = Search(options, progress, lower=_finite(check.optimum("controller")))
-    _attempts(dual, search, measured=True, rate=check.slowest_rate())
-    gain, achieved = _gain_of(search, "controller", check)
-    return _bound("controller", search, achieved, "observer LPI of the adjoint system", gain)
+    fundamental, reason = None, ""
+    try:
+        pie = convert(dual_system(pde))
+        shape = structure(pie)
+        formulation = "observer LPI of the adjoint system, u = K x"
+    except NotAdjointable as error:
+        reason = str(error)
+        primal = convert(pde)
+        pie, fundamental = dual_pie(primal), primal.T
+        shape = dual_structure(pie)
+        formulation = f"dual LPI, u = K f on the highest derivatives: {reason}"
+        progress(f"no adjoint system ({reason}): the usual dual LPI")
+    _attempts(pie, shape, search, measured=True, rate=check.slowest_rate())
+    gain, achieved = _gain_of(search, "controller", check, fundamental)
+    result = _bound("controller", search, achieved, formulation, gain)
+    if result.best is None and reason:
+        result = replace(result, message=f"{result.message}. No adjoint formulation: {reason}")
+    return result
 
 
-def _attempts(pde: Pde, search: Search, *, measured: bool, rate: float) -> None:
+def _attempts(pie: Pie, shape: Structure, search: Search, *, measured: bool, rate: float) -> None:
     """Gain-type attempts of growing degree on the scaled PIE."""
-    scale = scaled(convert(pde))
-    ends = dissipated_ends(scale.pie, measured)
+    scale = scaled(pie)
+    ends = dissipated_ends(scale.pie, shape, measured)
     epsilon = min(MARGIN, 2e-4 * rate)
 
     def attempt(degree: int) -> tuple[Attempt, Certificate | None]:
         start = time.perf_counter()
-        inequality = Inequality(scale.pie, degree, measured=measured, ends=ends)
+        inequality = Inequality(scale.pie, shape, degree, measured=measured, ends=ends)
         program = inequality.program
         assembly = time.perf_counter() - start
 
@@ -145,7 +155,9 @@ def _sound(point: Point, found: Certificate) -> bool:
     )
 
 
-def _gain_of(search: Search, role: str, check: Verification) -> tuple[Gain | None, Achieved | None]:
+def _gain_of(
+    search: Search, role: str, check: Verification, fundamental: PIOperator | None = None
+) -> tuple[Gain | None, Achieved | None]:
     """The best attempt's gain and what it achieves."""
     if search.best is None:
         return None, None
@@ -158,7 +170,7 @@ def _gain_of(search: Search, role: str, check: Verification) -> tuple[Gain | Non
         return None, None
     if role == "controller":
         operator = operator.adjoint
-    gain = Gain(role, operator, tail)
+    gain = Gain(role, operator, tail, fundamental)
     return gain, check.loop(gain)
 
 
@@ -251,11 +263,12 @@ def _stability(pde: Pde, options: Options, progress: Progress) -> Result:
 
 def _stability_attempts(pde: Pde, search: Search, *, lossless: bool, rate: float) -> None:
     pie = convert(pde)
-    ends = dissipated_ends(pie, False)
+    shape = structure(pie)
+    ends = dissipated_ends(pie, shape, False)
 
     def attempt(degree: int) -> tuple[Attempt, Certificate | None]:
         start = time.perf_counter()
-        inequality = Inequality(pie, degree, channels=False, lossless=lossless, ends=ends)
+        inequality = Inequality(pie, shape, degree, channels=False, lossless=lossless, ends=ends)
         program = inequality.program
         assembly = time.perf_counter() - start
 

@@ -23,12 +23,14 @@ class Gain:
     """A gain and where it acts.
 
     role 'observer': L, outputs -> rate of the state, xh_t = A xh + L (C2 xh - y). role 'controller': K, state
-    -> controls, u = K x. tail: relative size of the last fitted coefficients.
+    -> controls, u = K x. tail: relative size of the last fitted coefficients. fundamental: for a K that acts on
+    the fundamental state f instead, the map f -> x = T f.
     """
 
     role: str
     operator: PIOperator
     tail: float
+    fundamental: PIOperator | None = None
 
 
 def gain_operator(P: PIOperator, Z: PIOperator) -> tuple[PIOperator, float]:

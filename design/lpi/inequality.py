@@ -20,10 +20,9 @@ from scipy import linalg
 from design.lpi.rows import (
     ENDS,
     Rows,
+    Structure,
     build_rows,
-    end_values,
     functions,
-    independent,
     stack,
     times,
 )
@@ -61,6 +60,7 @@ class Inequality:
     def __init__(
         self,
         pie: Pie,
+        structure: Structure,
         degree: int,
         *,
         channels: bool = True,
@@ -95,7 +95,7 @@ class Inequality:
             self.y = pie.C2 @ self.f
             if channels:
                 self.y = self.y - pie.D21 @ self.w
-        self.rows: Rows = build_rows(pie, degree, pie.C2 if measured else None, ends)
+        self.rows: Rows = build_rows(pie, structure, degree, pie.C2 if measured else None, ends)
 
     @cached_property
     def gain_rows(self) -> PIOperator:
@@ -239,18 +239,17 @@ class Inequality:
         return float(np.linalg.eigvalsh(reduced)[-1]), -largest, smallest
 
 
-def dissipated_ends(pie: Pie, measured: bool) -> PIOperator | None:
+def dissipated_ends(pie: Pie, structure: Structure, measured: bool) -> PIOperator | None:
     """End values whose squares some V can dissipate, as rows of constants; None if there are none.
 
     Found by the equalities of the inequality of degree 1 alone: a square that no P can make is forced to zero,
     and rows of that kind would only spoil the program (they are unbounded in the norm).
     """
-    ends = end_values(pie)
+    ends = structure.ends
     if ends is None:
         return None
-    ends = independent(ends)
-    rows = build_rows(pie, 1, pie.C2 if measured else None, ends)
-    bounded = build_rows(pie, 1, pie.C2 if measured else None).inequality
+    rows = build_rows(pie, structure, 1, pie.C2 if measured else None, ends)
+    bounded = build_rows(pie, structure, 1, pie.C2 if measured else None).inequality
     inequality = unit_rows(vertical(bounded, ends))
     P = rows.lyapunov
     layout = Layout(

@@ -105,8 +105,21 @@ def family(rows: PIOperator, degree: int) -> PIOperator | None:
     return None if degree < 0 else stack(times(rows, degree), kernels(rows, degree))
 
 
+@dataclass(frozen=True)
+class Structure:
+    """What the rows are built from: the levels (f -> d^j x_i, m_i - j) that state i can dissipate, and the end
+    values that these do not bound. For a Pie by `structure`, for its dual by design.lpi.dual."""
+
+    levels: tuple[tuple[PIOperator, int], ...]
+    ends: PIOperator | None
+
+
 def build_rows(
-    pie: Pie, degree: int, measured: PIOperator | None = None, ends: PIOperator | None = None
+    pie: Pie,
+    structure: Structure,
+    degree: int,
+    measured: PIOperator | None = None,
+    ends: PIOperator | None = None,
 ) -> Rows:
     """Rows for an LPI of this degree.
 
@@ -115,7 +128,7 @@ def build_rows(
     m, n = pie.T.shape_in
     state = PIOperator.identity(Shape(m, n))
     ode = lifted(state.rows(range(m), [])) if m else None
-    levels = list(_levels(pie))
+    levels = structure.levels
     inequality = independent(
         stack(
             *(family(row, degree - below) for row, below in levels),
@@ -186,6 +199,11 @@ def flattened(rows: PIOperator) -> Array:
     return np.concatenate([p.reshape(count, p.size // max(count, 1)) for p in parts], axis=1)
 
 
+def structure(pie: Pie) -> Structure:
+    """Levels and end values of a PDE's own PIE."""
+    return Structure(levels=tuple(_levels(pie)), ends=_end_values(pie))
+
+
 def _levels(pie: Pie) -> list[tuple[PIOperator, int]]:
     """(f -> d^j x_i, m_i - j) for j = m_i .. 0: what state i can dissipate, and all below it."""
     derivatives = {(i, j): row for i, j, row in pie.derivatives}
@@ -203,7 +221,7 @@ def _levels(pie: Pie) -> list[tuple[PIOperator, int]]:
     return levels
 
 
-def end_values(pie: Pie) -> PIOperator | None:
+def _end_values(pie: Pie) -> PIOperator | None:
     """End values that the inequality's rows do not bound; which can be dissipated, the equalities tell."""
     ends = []
     for i, j, _, row in pie.ends:
@@ -213,7 +231,8 @@ def end_values(pie: Pie) -> PIOperator | None:
             if _own_derivative(pie.pde, i) % 2 == 0 and dissipation_order(pie.pde, i) > 0:
                 continue  # parabolic: end values below m are integrals already, those above are unbounded
             ends.append(lifted(row))
-    return stack(*ends)
+    found = stack(*ends)
+    return None if found is None else independent(found)
 
 
 def _own_derivative(pde: Pde, state: int) -> int:
