@@ -72,6 +72,7 @@ class Inequality:
         self.degree = degree
         self.measured = measured
         self.lossless = lossless
+        self._levels = structure.levels
         none = Shape(0, 0)
         self._nz = pie.C1.shape_out if channels else none
         self._nw = pie.B1.shape_in if channels else none
@@ -154,10 +155,15 @@ class Inequality:
         return GramProgram(coefficient_matrix([constant, *tables]), layout)
 
     def _channel_rows(self) -> list[PIOperator]:
-        """Numbers as constants times polynomials, as many as products with B1 can make; functions plain."""
+        """Numbers as constants times polynomials, functions plain.
+
+        A number meets the state in integrals like w int_0^1 h x with h = (A^-1)* B1, which completing the square
+        needs: as many polynomials as the profile and the integrations by parts can make.
+        """
         out = []
-        profile = self.pie.B1.q2.shape[2] if self._nw.finite else 1
-        for signal, degree in ((self.z, self.degree), (self.w, self.degree + profile - 1)):
+        highest = self.degree + max(0, 2 * max(below for _, below in self._levels) - 1)
+        profile = self.pie.B1.q2.shape[2] - 1 if self._nw.finite else 0
+        for signal, degree in ((self.z, highest), (self.w, highest + profile)):
             finite = signal.rows(range(signal.shape_out.finite), [])
             if finite.shape_out.finite:
                 spread = times(functions(finite), degree)

@@ -9,6 +9,9 @@ import numpy as np
 from design.operators import PIOperator
 from design.pde.convert import Pie
 
+SECTION = 5
+"""Degrees of f that the size of an output is measured on."""
+
 
 @dataclass(frozen=True)
 class Scaled:
@@ -19,9 +22,9 @@ class Scaled:
 
 
 def scaled(pie: Pie) -> Scaled:
-    """Divide disturbances by |B1| and regulated outputs by |C1| (Hilbert-Schmidt); y and its gain stay."""
+    """Divide disturbances by |B1| (Hilbert-Schmidt) and regulated outputs by |C1| on x; y and its gain stay."""
     w = size(pie.B1) or size(pie.D21) or 1.0
-    z = size(pie.C1) or 1.0
+    z = size_on_state(pie.C1, pie.T) or 1.0
     return Scaled(
         pie=replace(
             pie,
@@ -32,6 +35,18 @@ def scaled(pie: Pie) -> Scaled:
         ),
         gamma=w * z,
     )
+
+
+def size_on_state(operator: PIOperator, T: PIOperator) -> float:
+    """Largest |operator f| / |T f| over polynomials f of low degree: a size also where it is unbounded on x."""
+    state = T.discretise(SECTION, SECTION + 12)
+    value = operator.discretise(SECTION, SECTION + 12)
+    if not value.size:
+        return 0.0
+    scale = np.sqrt(np.sum(state**2, axis=0).clip(1e-300))
+    _, values, right = np.linalg.svd(state / scale, full_matrices=False)
+    seen = values > 1e-9 * values[0]
+    return float(np.linalg.norm((value / scale) @ right[seen].T / values[seen], 2))
 
 
 def size(operator: PIOperator) -> float:

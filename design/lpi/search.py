@@ -68,11 +68,13 @@ class Search:
             if certificate is not None and (before is None or done.value < before.attempt.value):
                 self.best = Certified(done, certificate)
             self.progress(_line(done, certificate is not None))
-            if self.best is None:
-                pass
-            elif self.lower is not None and self.best.attempt.value <= self.lower * (1.0 + CLOSE):
+            if self.best is None:  # nothing yet: any time that is left is well spent
+                if self.remaining_s() > 0.0:
+                    continue
                 return
-            elif before is not None:
+            if self.lower is not None and self.best.attempt.value <= self.lower * (1.0 + CLOSE):
+                return
+            if before is not None:
                 improved = self.best.attempt.value < before.attempt.value * (1.0 - CLOSE)
                 without_progress = 0 if improved else without_progress + 1
                 if without_progress == 2:
