@@ -16,8 +16,10 @@ from design.pde.model import Pde
 
 GAP = 1e-4
 """Distance from the spectral limit, relative, that is tried first and is close enough."""
-STEPS = 6
-"""Halvings of the uncertified interval per degree, when the first try fails."""
+STEPS = 10
+"""Halvings of the interval that is left, at the last degree, as far as time allows."""
+_GROWTH = 5.0
+"""How much longer a degree takes than the one before it."""
 DEGREES = range(1, 7)
 
 
@@ -45,41 +47,45 @@ def bisect_stability(
     attempts: list[Attempt] = []
     last: Attempt | None = None
 
+    def remaining_s() -> float:
+        return options.time_limit_s - (time.perf_counter() - start)
+
     def certified(parameter: float, degree: int) -> bool:
         nonlocal last
-        left = options.time_limit_s - (time.perf_counter() - start)
-        result = certify(
-            problem(parameter), replace(options, degree=degree, time_limit_s=max(left, 1.0)), silent
-        )
+        left = replace(options, degree=degree, time_limit_s=max(remaining_s(), 1.0))
+        result = certify(problem(parameter), left, silent)
         if result.attempts:
             last = result.attempts[-1]
         return result.status is Status.CERTIFIED
 
-    for degree in DEGREES if options.degree is None else (options.degree,):
+    degrees = DEGREES if options.degree is None else range(options.degree, options.degree + 1)
+    for degree in degrees:
         began = time.perf_counter()
-        reached = certified(target, degree)
-        if reached:
+        if certified(target, degree):
             best = target
-        else:
-            inside = stable if best is None else best
-            if best is None and certified(stable, degree):
-                best = stable
-            outside = target
-            for _ in range(STEPS if best is not None else 0):
-                middle = 0.5 * (inside + outside)
-                if certified(middle, degree):
-                    inside = best = middle
-                else:
-                    outside = middle
+        else:  # one step of the bisection, so that something is certified whatever comes
+            middle = stable if best is None else 0.5 * (best + target)
+            best = middle if certified(middle, degree) else best
+        took = time.perf_counter() - began
         if last is not None:
             attempts.append(last)
         progress(
             f"degree {degree}: {'nothing' if best is None else f'certified up to {best:.8g}'}, "
-            f"{time.perf_counter() - began:.1f} s"
+            f"{took:.1f} s"
         )
-        left = options.time_limit_s - (time.perf_counter() - start)
-        if reached or 4.0 * (time.perf_counter() - began) > left:
+        if best == target or _GROWTH * took > remaining_s():
             break
+    if best is not None and best != target:
+        inside, outside, step_s = best, target, took
+        for _ in range(STEPS):
+            if step_s > remaining_s():
+                break
+            middle = 0.5 * (inside + outside)
+            began = time.perf_counter()
+            inside, outside = (middle, outside) if certified(middle, degree) else (inside, middle)
+            step_s = time.perf_counter() - began
+        best = inside
+        progress(f"degree {degree}: certified up to {best:.8g}")
     return Result(
         task="stability",
         status=Status.UNRELIABLE if best is None else Status.CERTIFIED,

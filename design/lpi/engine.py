@@ -74,7 +74,7 @@ def _gain(pde: Pde, options: Options, progress: Progress) -> Result:
     if check.unstable():
         return _unstable("gain", check)
     open_loop = check.open_loop()
-    search = Search(options, progress, lower=_finite(open_loop.value))
+    search = Search("gain", options, progress, lower=_finite(open_loop.value))
     pie = convert(pde)
     _attempts(pie, structure(pie), search, measured=False, rate=check.slowest_rate())
     return _bound("gain", search, open_loop, "bounded real lemma")
@@ -82,7 +82,7 @@ def _gain(pde: Pde, options: Options, progress: Progress) -> Result:
 
 def _observer(pde: Pde, options: Options, progress: Progress) -> Result:
     check = Verification(pde)
-    search = Search(options, progress, lower=_finite(check.optimum("observer")))
+    search = Search("observer", options, progress, lower=_finite(check.optimum("observer")))
     pie = convert(pde)
     _attempts(pie, structure(pie), search, measured=True, rate=check.slowest_rate())
     gain, achieved = _gain_of(search, "observer", check)
@@ -91,7 +91,7 @@ def _observer(pde: Pde, options: Options, progress: Progress) -> Result:
 
 def _controller(pde: Pde, options: Options, progress: Progress) -> Result:
     check = Verification(pde)
-    search = Search(options, progress, lower=_finite(check.optimum("controller")))
+    search = Search("controller", options, progress, lower=_finite(check.optimum("controller")))
     fundamental, reason = None, ""
     try:
         pie = convert(dual_system(pde))
@@ -191,7 +191,10 @@ def _bound(
     elif not math.isfinite(achieved.value):
         message = "the discretised loop is unstable although the inequality holds: refused"
     elif achieved.value > best.value * (1.0 + ACHIEVED_MARGIN):
-        message = f"the discretisation reaches {achieved.value:.6g}, more than the certified {best.value:.6g}: refused"
+        message = (
+            f"the discretisation reaches {achieved.value:.6g}, more than the {best.value:.6g} "
+            "that the inequality certifies: refused"
+        )
     else:
         status = Status.CERTIFIED
         message = f"certified at degree {best.degree}"
@@ -237,7 +240,7 @@ def _stability(pde: Pde, options: Options, progress: Progress) -> Result:
     system = check.system(23)
     largest = float(np.abs(system.eigenvalues).max(initial=1.0))
     marginal = abs(check.abscissa()) <= LOSSLESS * largest
-    search = Search(options, progress, lower=1.0)
+    search = Search("stability", options, progress, lower=1.0)
     _stability_attempts(pde, search, lossless=marginal, rate=check.slowest_rate())
     best = search.best.attempt if search.best else None
     kind = "conserved" if marginal else "decreasing"
@@ -307,7 +310,7 @@ def _stability_attempts(pde: Pde, search: Search, *, lossless: bool, rate: float
 def _norm(pde: Pde, options: Options, progress: Progress) -> Result:
     check = Verification(pde)
     achieved = check.norm()
-    search = Search(options, progress, lower=_finite(achieved.value))
+    search = Search("norm", options, progress, lower=_finite(achieved.value))
     pie = convert(pde)
 
     def attempt(degree: int) -> tuple[Attempt, Certificate | None]:

@@ -157,8 +157,8 @@ class Inequality:
     def _channel_rows(self) -> list[PIOperator]:
         """Numbers as constants times polynomials, functions plain.
 
-        A number meets the state in integrals like w int_0^1 h x with h = (A^-1)* B1, which completing the square
-        needs: as many polynomials as the profile and the integrations by parts can make.
+        A number meets the state in integrals like w int_0^1 h x with h = (A^-1)* B1, which completing the
+        square needs: as many polynomials as the profile and the integrations by parts can make.
         """
         out = []
         highest = self.degree + max(0, 2 * max(below for _, below in self._levels) - 1)

@@ -15,7 +15,8 @@ from pathlib import Path
 
 from design.lpi.inequality import Certificate, Inequality
 from design.lpi.norm import NormInequality
-from design.lpi.result import Attempt, Options, Progress
+from design.lpi.reporter import Reporter
+from design.lpi.result import Attempt, Options, Progress, Result, Status
 from design.lpi.sdp import GramProgram, Point
 
 CLOSE = 5e-3
@@ -42,10 +43,10 @@ class Certified:
 class Search:
     """Runs attempts of growing degree within the options; `lower` is a value no true bound is below."""
 
+    task: str
     options: Options
     progress: Progress
     lower: float | None = None
-    smaller_is_better: bool = True
     attempts: list[Attempt] = field(default_factory=list)
     best: Certified | None = None
     started: float = field(default_factory=time.perf_counter)
@@ -67,6 +68,7 @@ class Search:
             before = self.best
             if certificate is not None and (before is None or done.value < before.attempt.value):
                 self.best = Certified(done, certificate)
+                self._tell(done)
             self.progress(_line(done, certificate is not None))
             if self.best is None:  # nothing yet: any time that is left is well spent
                 if self.remaining_s() > 0.0:
@@ -81,6 +83,21 @@ class Search:
                     return
             if _GROWTH * (time.perf_counter() - started) > self.remaining_s():
                 return
+
+    def _tell(self, best: Attempt) -> None:
+        """Hand the best so far to those who keep it."""
+        if isinstance(self.progress, Reporter):
+            self.progress.best(
+                Result(
+                    task=self.task,
+                    status=Status.CERTIFIED,
+                    message=f"stopped; the best so far is of degree {best.degree}",
+                    gamma=None if self.task == "stability" else best.value,
+                    best=best,
+                    attempts=tuple(self.attempts),
+                    seconds=time.perf_counter() - self.started,
+                )
+            )
 
 
 def _line(attempt: Attempt, certified: bool) -> str:
