@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 
-from supervise.shipped import DEFAULT_ARM, DEFAULT_GAINS
+from supervise.shipped import DEFAULT_ARM, DEFAULT_GAINS, SUITE
 from wire.errors import ExitCode, OctarmError, UsageError
 
 if TYPE_CHECKING:
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 Ints = Annotated[tuple[int, ...], tyro.conf.UseAppendAction]
+Settings = Annotated[
+    tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="NAME=VALUE")
+]
+Span = Annotated[tuple[str, float, float] | None, tyro.conf.arg(metavar="NAME LOW HIGH")]
 
 
 def run(
@@ -183,6 +187,69 @@ def design(
     return int(ExitCode.OK)
 
 
+def solve(
+    file: Annotated[Path | None, tyro.conf.Positional] = None,
+    *,
+    task: Literal["stability", "gain", "observer", "controller", "norm"] | None = None,
+    bisect: Span = None,
+    settings: Settings = (),
+    degree: int | None = None,
+    time_limit: float = 120.0,
+    solver: str = "CLARABEL",
+    dump_problem: Path | None = None,
+    suite: Flag = False,
+    only: tuple[str, ...] = (),
+    json: Flag = False,
+    quiet: Flag = False,
+) -> int:
+    """Solve any linear 1-D PDE problem: stability, gain, observer, state feedback, norm; certified.
+
+    Args:
+        file: Problem file (TOML): states, equations, boundary conditions, inputs and outputs.
+        task: What is asked; default: the file's task, or the one that is about all that it gives.
+        bisect: Look for the limit of stability in a parameter; default: the file's bisect.
+        settings: Another value for a parameter of the file; may be given several times.
+        degree: Polynomial degree of the certificate; default: raised while that pays.
+        time_limit: Seconds for the whole answer; with --suite for every row.
+        solver: Semidefinite solver, by its name in CVXPY.
+        dump_problem: Directory for the semidefinite programs (SDPA sparse format), made if missing.
+        suite: Solve the reference problems instead of a file and compare with what is true.
+        only: Rows of the suite, by their ids.
+        json: Print one JSON object instead of the table.
+        quiet: No progress.
+    """
+    from analysis.solve_table import answer_table, suite_table
+    from design.solve_command import Choices, finite, prepare
+    from design.solve_suite import read_suite
+    from supervise.solving import solve_in_child
+    from supervise.suite import run_suite
+
+    def tell(text: str) -> None:
+        if not (quiet or json):
+            print(text, file=sys.stderr, flush=True)
+
+    choices = Choices(task, bisect, settings, degree, time_limit, solver, dump_problem)
+    if suite:
+        if file is not None or choices != Choices(time_limit_s=time_limit, solver=solver):
+            raise UsageError(
+                "--suite: takes --only, --time-limit and --solver, no file or other choice"
+            )
+        table = run_suite(read_suite(SUITE, only), SUITE.parent, choices, solve_in_child, tell)
+        _print_json(finite(table)) if json else print(suite_table(table), end="")
+        refused, interrupted = not table["ok"], table["interrupted"]
+    else:
+        if file is None or only:
+            raise UsageError(
+                "--only: is for --suite" if only else "FILE: expected a problem file, or --suite"
+            )
+        answer = solve_in_child(prepare(file, choices), tell)
+        _print_json(finite(answer.facts)) if json else print(answer_table(answer.facts), end="")
+        refused, interrupted = answer.facts["status"] != "certified", answer.interrupted
+    if interrupted:
+        raise KeyboardInterrupt
+    return int(ExitCode.GAINS_REFUSED if refused else ExitCode.OK)
+
+
 def deploy(
     *,
     gains: Path = DEFAULT_GAINS,
@@ -248,6 +315,7 @@ def doctor(*, json: Flag = False) -> int:
 VERBS: dict[str, Callable[..., int]] = {
     "run": run,
     "design": design,
+    "solve": solve,
     "deploy": deploy,
     "doctor": doctor,
 }

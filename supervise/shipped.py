@@ -1,4 +1,4 @@
-"""Where the shipped arm and gains lie; the command line and the plan of a run take their defaults here."""
+"""Where the shipped arm, gains and reference problems lie: the defaults of the command line."""
 
 from __future__ import annotations
 
@@ -7,3 +7,4 @@ from pathlib import Path
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 DEFAULT_ARM = EXAMPLES / "chapter_arm.toml"
 DEFAULT_GAINS = EXAMPLES / "default.gains.json"
+SUITE = EXAMPLES / "suite.toml"
