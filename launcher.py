@@ -190,7 +190,8 @@ def design(
 def solve(
     file: Annotated[Path | None, tyro.conf.Positional] = None,
     *,
-    task: Literal["stability", "gain", "observer", "controller", "norm"] | None = None,
+    task: Literal["stability", "gain", "observer", "controller", "norm", "h2", "h2-observer"]
+    | None = None,
     bisect: Span = None,
     settings: Settings = (),
     degree: int | None = None,

@@ -21,6 +21,8 @@ _GAMMA = {
     "observer": "no disturbance is amplified more, in the error of the estimated outputs: proven",
     "controller": "no disturbance is amplified more, in the regulated outputs with feedback: proven",
     "norm": "least c that is proven for |of| <= c |by|",
+    "h2": "root of the variance of the regulated outputs under white noise: no larger, proven",
+    "h2-observer": "root of the error's variance under white noise: no larger, proven",
 }
 _ACHIEVED = {
     "stability": "rightmost eigenvalue",
@@ -28,6 +30,8 @@ _ACHIEVED = {
     "observer": "the norm with this observer",
     "controller": "the norm with this feedback",
     "norm": "the ratio",
+    "h2": "the H2 norm",
+    "h2-observer": "the H2 norm with this observer",
 }
 _PARTS = {
     "assembly": "assembly",

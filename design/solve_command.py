@@ -37,8 +37,10 @@ _USES: dict[Task, frozenset[str]] = {
     Task.OBSERVER: frozenset({"inputs.disturbances", "outputs.regulated", "outputs.measured"}),
     Task.CONTROLLER: frozenset({"inputs.disturbances", "outputs.regulated", "inputs.controls"}),
     Task.NORM: frozenset({"norm"}),
+    Task.H2: frozenset({"inputs.disturbances", "outputs.regulated"}),
+    Task.H2_OBSERVER: frozenset({"inputs.disturbances", "outputs.regulated", "outputs.measured"}),
 }
-"""What of a problem a task is about."""
+"""What of a problem a task is about; of two with the same needs the first is what a file without task means."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,9 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+from scipy import linalg
 
+from design.channel import Channel
 from design.lpi.gains import Gain
 from design.lpi.result import Achieved
 from design.pde.evidence import (
@@ -82,6 +84,33 @@ class Verification:
             self._refined(norm), self.system(_OPTIMUM_SIZE).gain(), self.optimum(gain.role)
         )
 
+    def h2(self, gain: Gain | None = None) -> Achieved:
+        """The H2 norm of the open loop or of the observer's error; beside it the Kalman filter's."""
+
+        def norm(system: System) -> float:
+            if gain is None:
+                return _h2(Channel(system.A, system.B1, system.C1, system.D11))
+            L = gain.operator.discretise(system.size, system.rows)
+            return _h2(observer_loop(system, L))
+
+        if gain is None:
+            return _achieved(self._refined(norm))
+        system = self.system(_OPTIMUM_SIZE)
+        without = _h2(Channel(system.A, system.B1, system.C1, system.D11))
+        return _achieved(self._refined(norm), without, self.kalman())
+
+    def kalman(self) -> float | None:
+        """The smallest H2 norm of any observer, None where the noise is singular or nothing stabilises."""
+        s = self.system(_OPTIMUM_SIZE)
+        try:
+            X = linalg.solve_continuous_are(
+                s.A.T, s.C2.T, s.B1 @ s.B1.T, s.D21 @ s.D21.T, s=s.B1 @ s.D21.T
+            )
+        except (linalg.LinAlgError, ValueError):
+            return None
+        value = float(np.trace(s.C1 @ X @ s.C1.T))
+        return math.sqrt(value) if value > 0.0 else None
+
     def optimum(self, role: str) -> float | None:
         """The infimum of gamma over all gains, None where no Riccati equation gives it."""
         of = observer_optimum if role == "observer" else controller_optimum
@@ -89,6 +118,14 @@ class Verification:
 
     def _refined(self, figure: Callable[[System], float]) -> Refined:
         return refine(lambda n: figure(self.system(n)), tolerance=TOLERANCE, seconds=self.seconds)
+
+
+def _h2(channel: Channel) -> float:
+    """tr(C X C*)^(1/2) with A X + X A* + B B* = 0; infinite unless all modes decay."""
+    if channel.decay() <= 0.0:
+        return math.inf
+    X = linalg.solve_continuous_lyapunov(channel.A, -channel.B @ channel.B.T)
+    return math.sqrt(max(float(np.trace(channel.C @ X @ channel.C.T)), 0.0))
 
 
 def _achieved(

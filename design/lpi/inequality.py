@@ -54,7 +54,7 @@ class Inequality:
     """The inequality for one PIE and one degree.
 
     channels=False leaves w and z away (stability); measured=False leaves Z away; lossless=True asks for
-    equality, a conserved V, instead of an inequality.
+    equality, a conserved V, instead of an inequality; weighed=True adds |C1 f|^2 (H2).
     """
 
     def __init__(
@@ -67,6 +67,7 @@ class Inequality:
         measured: bool = False,
         lossless: bool = False,
         ends: PIOperator | None = None,
+        weighed: bool = False,
     ) -> None:
         self.pie = pie
         self.degree = degree
@@ -96,6 +97,7 @@ class Inequality:
             self.y = pie.C2 @ self.f
             if channels:
                 self.y = self.y - pie.D21 @ self.w
+        self.weighed = functions(pie.C1) @ self.f if weighed else None
         self.rows: Rows = build_rows(pie, structure, degree, pie.C2 if measured else None, ends)
 
     @cached_property
@@ -109,11 +111,22 @@ class Inequality:
     @cached_property
     def program(self) -> GramProgram:
         """The semidefinite program; numbers gamma (with channels), delta and epsilon."""
+        tables, layout = self._tables()
+        return GramProgram(coefficient_matrix(tables), layout)
+
+    def _lyapunov_rows(self, of: PIOperator) -> PIOperator:
+        """The rows of P applied to x or x_t."""
+        return self.rows.lyapunov @ of
+
+    def _tables(self) -> tuple[list[FormTable], Layout]:
+        """All terms of the inequality, in the order of the layout's columns."""
         tables: list[FormTable] = []
         names: list[str] = []
         top = self.rows.top @ self.f
         epsilon = forms(top, top).trace() * 0.5
         constant = epsilon * 0.0
+        if self.weighed is not None:
+            constant = forms(self.weighed, self.weighed).trace() * 0.5
         inequality = [] if self.lossless else [self.rows.inequality @ self.f]
         if self._finite + self._functions:
             z, w = functions(self.z), functions(self.w)
@@ -133,9 +146,9 @@ class Inequality:
             z_table = forms(self.gain_rows @ self.x, functions(self.y))
             free = z_table.p.shape[0] * z_table.p.shape[1]
             tables.append(z_table)
-        P = self.rows.lyapunov
-        tables.append(forms(P @ self.x, P @ self.x_t).symmetric().upper(0.5))
-        grams = [("P", P.shape_out.functions)]
+        Px, Px_t = self._lyapunov_rows(self.x), self._lyapunov_rows(self.x_t)
+        tables.append(forms(Px, Px_t).symmetric().upper(0.5))
+        grams = [("P", Px.shape_out.functions)]
         for name, end in zip(("P s", "P 1-s"), ENDS, strict=True):
             multiples = self.rows.lyapunov_multiples
             if multiples is not None:
@@ -152,7 +165,7 @@ class Inequality:
                     tables.append(forms(weighted(multiples, end), multiples).upper(0.5))
                     grams.append((name, multiples.shape_out.functions))
         layout = Layout(numbers=tuple(names), free=free, grams=tuple(grams))
-        return GramProgram(coefficient_matrix([constant, *tables]), layout)
+        return [constant, *tables], layout
 
     def _channel_rows(self) -> list[PIOperator]:
         """Numbers as constants times polynomials, functions plain.
@@ -161,7 +174,7 @@ class Inequality:
         square needs: as many polynomials as the profile and the integrations by parts can make.
         """
         out = []
-        highest = self.degree + max(0, 2 * max(below for _, below in self._levels) - 1)
+        highest = self.degree + max(0, 2 * max((below for _, below in self._levels), default=0) - 1)
         profile = self.pie.B1.q2.shape[2] - 1 if self._nw.finite else 0
         for signal, degree in ((self.z, highest), (self.w, highest + profile)):
             finite = signal.rows(range(signal.shape_out.finite), [])
@@ -176,7 +189,8 @@ class Inequality:
     def operators(self, point: Point) -> tuple[PIOperator, PIOperator | None]:
         """P = delta I + R* G R + weighted multiples, and Z from a point of the program."""
         rows = self.rows.lyapunov
-        gram = PIOperator.multiplier(point.grams["P"][:, :, None])
+        own = point.grams["P"][-rows.shape_out.functions :, -rows.shape_out.functions :]
+        gram = PIOperator.multiplier(own[:, :, None])
         P = PIOperator.identity(self.pie.T.shape_out) * point.numbers["delta"]
         P = P + rows.adjoint @ gram @ rows
         for name, end in zip(("P s", "P 1-s"), ENDS, strict=True):
@@ -203,6 +217,8 @@ class Inequality:
         half = self.x.adjoint @ (P @ self.x_t)
         if Z is not None:
             half = half + self.x.adjoint @ (Z @ self.y)
+        if self.weighed is not None:
+            half = half + (self.weighed.adjoint @ self.weighed) * 0.5
         if sum(self._nz):
             half = half + self.z.adjoint @ self.z_of
         found = [self._on_section(half, P, size) for size in sections]

@@ -47,7 +47,7 @@ class Attempt:
     residual: float
     """Largest violated coefficient equality, relative to the largest coefficient used."""
     smallest_gram_eigenvalue: float
-    """Over all Gram matrices, relative to the largest of each."""
+    """Over all Gram matrices, relative to the largest eigenvalue of them all."""
     margin: float
     """Minus the largest eigenvalue of the inequality's form in the dissipation norm, recomputed from P and Z:
     positive is strict."""

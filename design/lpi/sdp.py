@@ -41,7 +41,7 @@ class Point:
     grams: dict[str, Array]
     residual: float
     smallest_eigenvalue: float
-    """Over all Gram matrices, relative to the largest of each."""
+    """Over all Gram matrices, relative to the largest eigenvalue of them all."""
     iterations: int
     modelling_s: float
     solver_s: float
@@ -177,7 +177,7 @@ class GramProgram:
         numbers = dict(zip(self.layout.numbers, map(float, x[1:]), strict=False))
         grams = {}
         start = self._head()
-        smallest = 0.0
+        smallest, largest = 0.0, 1e-300
         for (name, size), kept in zip(self.layout.grams, self.kept.values(), strict=True):
             i, j = np.triu_indices(len(kept))
             gram = np.zeros((len(kept), len(kept)))
@@ -185,12 +185,14 @@ class GramProgram:
             start += i.size
             if len(kept):
                 values = np.linalg.eigvalsh(gram)
-                smallest = min(smallest, float(values[0] / max(values[-1], 1e-300)))
+                smallest = min(smallest, float(values[0]))
+                largest = max(largest, float(values[-1]))
             full = np.zeros((size, size))
             full[np.ix_(kept, kept)] = gram
             grams[name] = full
         columns = self._matrix[:, self._columns()]
-        residual = float(np.abs(columns @ x).max() / np.abs(columns * x).max())
+        largest = np.abs(columns * x).max()
+        residual = float(np.abs(columns @ x).max() / max(largest, 1e-300))
         free = x[1 + len(numbers) : self._head()]
         return replace(
             point,
@@ -198,7 +200,7 @@ class GramProgram:
             free=free,
             grams=grams,
             residual=residual,
-            smallest_eigenvalue=smallest,
+            smallest_eigenvalue=smallest / largest,
         )
 
     def _failed(self, status: str) -> Point:
@@ -262,10 +264,13 @@ class _DualModel:
             np.concatenate([block, np.eye(block.shape[1])[None] / trace])
             for block in program.blocks()
         ]
-        q, r = np.linalg.qr(self._F, mode="complete")
-        rank = self._F.shape[1]
-        self._l0 = -q[:, :rank] @ np.linalg.solve(r[:rank].T, c) if rank else np.zeros(len(self._b))
+        q, values, right = np.linalg.svd(self._F)
+        rank = int(np.count_nonzero(values > 1e-9 * values.max(initial=0.0)))
+        self._l0 = -q[:, :rank] @ (right[:rank] @ c / values[:rank])
         self._basis = q[:, rank:]
+        # with a remainder, the cost falls along numbers that no equality holds
+        remainder = np.linalg.norm(self._F.T @ self._l0 + c)
+        self._unbounded = bool(remainder > 1e-9 * np.linalg.norm(c))
         self._lmis = [
             (
                 np.einsum("ekl,em->mkl", block, self._basis, optimize=True),
@@ -277,6 +282,8 @@ class _DualModel:
 
     def solve(self, solver: str, time_limit_s: float) -> tuple[str, int, float]:
         """Status, iterations and seconds of the solver itself."""
+        if self._unbounded:
+            return "unbounded", 0, 0.0
         m = cp.Variable(self._basis.shape[1])
         self._sign = (self._N @ self._basis) @ m + (self._N @ self._l0 + self._p) >= 0
         self._psd = []

@@ -71,7 +71,8 @@ class Names:
 
     def known(self) -> list[str]:
         """Every name that an expression may use; derivatives last."""
-        plain = [v.name for v in (*self.states, *self.disturbances, *self.controls)]
+        signals = (*self.disturbances, *self.controls)
+        plain = [*(v.name for v in self.states), *(w.name for w in signals)]
         derivatives = [
             f"{state.name}_{'s' * j}"
             for state in self.states

@@ -31,6 +31,11 @@ class Task(StrEnum):
     OBSERVER = "observer"
     CONTROLLER = "controller"
     NORM = "norm"
+    H2 = "h2"
+    H2_OBSERVER = "h2-observer"
+
+
+_DISTURBED = (Task.GAIN, Task.OBSERVER, Task.CONTROLLER, Task.H2, Task.H2_OBSERVER)
 
 
 @dataclass(frozen=True)
@@ -113,9 +118,9 @@ def parse_problem(text: str, source: str, overrides: Mapping[str, float] | None 
 def check_task(pde: Pde, task: Task, where: str) -> None:
     """UsageError, opened by `where`, if the problem lacks what the task is about."""
     needs: dict[str, tuple[Iterable[object], tuple[Task, ...]]] = {
-        "inputs.disturbances": (pde.disturbances, (Task.GAIN, Task.OBSERVER, Task.CONTROLLER)),
-        "outputs.regulated": (pde.regulated, (Task.GAIN, Task.OBSERVER, Task.CONTROLLER)),
-        "outputs.measured": (pde.measured, (Task.OBSERVER,)),
+        "inputs.disturbances": (pde.disturbances, _DISTURBED),
+        "outputs.regulated": (pde.regulated, _DISTURBED),
+        "outputs.measured": (pde.measured, (Task.OBSERVER, Task.H2_OBSERVER)),
         "inputs.controls": (pde.controls, (Task.CONTROLLER,)),
         "norm.of": (pde.numerator, (Task.NORM,)),
     }

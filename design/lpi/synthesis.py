@@ -1,0 +1,124 @@
+"""The tasks gain, observer and controller: H-infinity bounds, alone and with a gain to be found.
+
+State feedback is the observer of the adjoint system, whose P is coercive on the state (theory, section 3);
+where there is no adjoint PDE, the usual dual LPI (chapter (21)).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+from design.lpi.achieved import Verification
+from design.lpi.dual import dual_pie, dual_structure
+from design.lpi.gains import Gain, gain_operator
+from design.lpi.inequality import Certificate, Inequality, dissipated_ends
+from design.lpi.result import Achieved, Attempt, Options, Progress, Result
+from design.lpi.rows import Structure, structure
+from design.lpi.scaling import scaled
+from design.lpi.sdp import Point
+from design.lpi.search import Search, make_attempt, solve_ladder
+from design.lpi.verdict import DELTA, bound, finite, margin, sound, unstable
+from design.operators import PIOperator
+from design.pde.adjoint import NotAdjointable, dual_system
+from design.pde.convert import Pie, convert
+from design.pde.model import Pde
+
+
+def gain(pde: Pde, options: Options, progress: Progress) -> Result:
+    """The H-infinity norm from disturbances to regulated outputs, bounded by the bounded real lemma."""
+    check = Verification(pde)
+    if check.unstable():
+        return unstable("gain", check)
+    open_loop = check.open_loop()
+    search = Search("gain", options, progress, lower=finite(open_loop.value))
+    pie = convert(pde)
+    _attempts(pie, structure(pie), search, measured=False, rate=check.slowest_rate())
+    return bound("gain", search, open_loop, "bounded real lemma")
+
+
+def observer(pde: Pde, options: Options, progress: Progress) -> Result:
+    """An observer and the H-infinity norm of its error."""
+    check = Verification(pde)
+    search = Search("observer", options, progress, lower=finite(check.optimum("observer")))
+    pie = convert(pde)
+    _attempts(pie, structure(pie), search, measured=True, rate=check.slowest_rate())
+    found, achieved = _gain_of(search, "observer", check)
+    return bound("observer", search, achieved, "observer LPI", found)
+
+
+def controller(pde: Pde, options: Options, progress: Progress) -> Result:
+    """A state feedback and the H-infinity norm of the loop."""
+    check = Verification(pde)
+    search = Search("controller", options, progress, lower=finite(check.optimum("controller")))
+    fundamental, reason = None, ""
+    try:
+        pie = convert(dual_system(pde))
+        shape = structure(pie)
+        formulation = "observer LPI of the adjoint system, u = K x"
+    except NotAdjointable as error:
+        reason = str(error)
+        primal = convert(pde)
+        pie, fundamental = dual_pie(primal), primal.T
+        shape = dual_structure(pie)
+        formulation = f"dual LPI, u = K f on the highest derivatives: {reason}"
+        progress(f"no adjoint system ({reason}): the usual dual LPI")
+    _attempts(pie, shape, search, measured=True, rate=check.slowest_rate())
+    found, achieved = _gain_of(search, "controller", check, fundamental)
+    result = bound("controller", search, achieved, formulation, found)
+    if result.best is None and reason:
+        result = replace(result, message=f"{result.message}. No adjoint formulation: {reason}")
+    return result
+
+
+def _attempts(pie: Pie, shape: Structure, search: Search, *, measured: bool, rate: float) -> None:
+    """Gain-type attempts of growing degree on the scaled PIE."""
+    scale = scaled(pie)
+    ends = dissipated_ends(scale.pie, shape, measured)
+    epsilon = margin(rate)
+
+    def attempt(degree: int) -> tuple[Attempt, Certificate | None]:
+        start = time.perf_counter()
+        inequality = Inequality(scale.pie, shape, degree, measured=measured, ends=ends)
+        program = inequality.program
+        assembly = time.perf_counter() - start
+
+        def judge(point: Point) -> tuple[bool, Certificate]:
+            found = inequality.certificate(*inequality.operators(point))
+            return sound(point, found) and math.isfinite(found.gamma), found
+
+        solved = solve_ladder(
+            program,
+            {"gamma": 1.0},
+            {"delta": DELTA, "epsilon": epsilon},
+            judge,
+            options=search.options,
+            remaining_s=search.remaining_s,
+            dump_name=f"degree_{degree}",
+        )
+        done = make_attempt(
+            inequality, assembly, solved, search.options.solver, lambda c: c.gamma * scale.gamma
+        )
+        return done, solved[1] if solved[2] else None
+
+    search.run(attempt)
+
+
+def _gain_of(
+    search: Search, role: str, check: Verification, fundamental: PIOperator | None = None
+) -> tuple[Gain | None, Achieved | None]:
+    """The best attempt's gain and what it achieves."""
+    if search.best is None:
+        return None, None
+    certificate = search.best.certificate
+    if certificate.P is None or certificate.Z is None:
+        return None, None
+    try:
+        operator, tail = gain_operator(certificate.P, certificate.Z)
+    except ArithmeticError:
+        return None, None
+    if role == "controller":
+        operator = operator.adjoint
+    gain = Gain(role, operator, tail, fundamental)
+    return gain, check.loop(gain)
