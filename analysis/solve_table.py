@@ -116,7 +116,7 @@ def _figures(f: dict[str, Any]) -> list[tuple[str, str, str]]:
     if f["achieved"] is not None:
         out.append(("achieved", _number(f["achieved"]), _achieved(f)))
     if f["open_loop"] is not None:
-        what = "observer" if task == "observer" else "feedback"
+        what = "observer" if "observer" in task else "feedback"
         out.append(("open loop", _number(f["open_loop"], "unstable"), f"the same without {what}"))
     if f["optimum"] is not None:
         out.append(("optimum", _number(f["optimum"]), _optimum(f)))

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+from design.lpi.reporter import Reporter
 from design.lpi.result import Achieved, Attempt, Options, Progress, Result, Status, silent
 from design.pde.evidence import stability_limit
 from design.pde.galerkin import discretise
@@ -73,6 +74,8 @@ def bisect_stability(
             f"degree {degree}: {'nothing' if best is None else f'certified up to {best:.8g}'}, "
             f"{took:.1f} s"
         )
+        if best is not None and isinstance(progress, Reporter):
+            progress.best(_so_far(best, attempts, time.perf_counter() - start))
         if best == target or _GROWTH * took > remaining_s():
             break
     if best is not None and best != target:
@@ -104,6 +107,18 @@ def bisect_stability(
         best=attempts[-1] if attempts else None,
         attempts=tuple(attempts),
         seconds=time.perf_counter() - start,
+    )
+
+
+def _so_far(best: float, attempts: list[Attempt], seconds: float) -> Result:
+    return Result(
+        task="stability",
+        status=Status.CERTIFIED,
+        message=f"stopped; the best so far is {best:.8g}",
+        limit=best,
+        best=attempts[-1],
+        attempts=tuple(attempts),
+        seconds=seconds,
     )
 
 
