@@ -264,9 +264,12 @@ class _DualModel:
             np.concatenate([block, np.eye(block.shape[1])[None] / trace])
             for block in program.blocks()
         ]
-        q, values, right = np.linalg.svd(self._F)
+        q, r = np.linalg.qr(self._F, mode="complete")
+        left, values, right = np.linalg.svd(self._F)
         rank = int(np.count_nonzero(values > 1e-9 * values.max(initial=0.0)))
-        self._l0 = -q[:, :rank] @ (right[:rank] @ c / values[:rank])
+        if rank < len(c):
+            q, r = left, values[:, None] * right[: values.size]
+        self._l0 = -q[:, :rank] @ np.linalg.lstsq(r[:rank].T, c, rcond=None)[0]
         self._basis = q[:, rank:]
         # with a remainder, the cost falls along numbers that no equality holds
         remainder = np.linalg.norm(self._F.T @ self._l0 + c)
