@@ -33,6 +33,9 @@ _ADMISSIBLE = 1e-9
 _DEPENDENT = 1e-5
 """A unit row whose part outside the rows before it is smaller than this adds nothing."""
 
+_UNBOUNDED = 1e-6
+"""An output whose part outside the span of the rows is larger than this share of it is not bounded by them."""
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -157,6 +160,20 @@ def build_rows(
         top=top,
         state=functions(state),
     )
+
+
+def unbounded(outputs: PIOperator, inequality: PIOperator) -> list[int]:
+    """Places of the numbers f -> R that are not in the span of the rows: no V = <x, P x> can bound them."""
+    found = []
+    for k in range(outputs.shape_out.finite):
+        row = lifted(outputs.rows([k], []))
+        flat = flattened(vertical(inequality, row))
+        size = np.linalg.norm(flat[-1])
+        basis = flat[:-1] / np.maximum(np.linalg.norm(flat[:-1], axis=1), 1e-300)[:, None]
+        rest = flat[-1] - basis.T @ np.linalg.lstsq(basis.T, flat[-1], rcond=1e-12)[0]
+        if np.linalg.norm(rest) > _UNBOUNDED * size:
+            found.append(k)
+    return found
 
 
 def dissipation_order(pde: Pde, state: int) -> int:

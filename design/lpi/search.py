@@ -69,7 +69,7 @@ class Search:
             if certificate is not None and (before is None or done.value < before.attempt.value):
                 self.best = Certified(done, certificate)
                 self._tell(done)
-            self.progress(_line(done, certificate is not None))
+            self.progress(self._line(done, certificate is not None))
             if self.best is None:  # nothing yet: any time that is left is well spent
                 if self.remaining_s() > 0.0:
                     continue
@@ -99,13 +99,14 @@ class Search:
                 )
             )
 
-
-def _line(attempt: Attempt, certified: bool) -> str:
-    value = f"{attempt.value:.6g}" if math.isfinite(attempt.value) else "nothing"
-    return (
-        f"degree {attempt.degree}: {value}{' certified' if certified else ''}, "
-        f"Gram matrices {'/'.join(map(str, attempt.gram_sizes))}, {attempt.seconds:.1f} s"
-    )
+    def _line(self, attempt: Attempt, certified: bool) -> str:
+        value = "nothing"
+        if certified:
+            value = "stable" if self.task == "stability" else f"{attempt.value:.6g}"
+        return (
+            f"degree {attempt.degree}: {value}{' certified' if certified else ''}, "
+            f"Gram matrices {'/'.join(map(str, attempt.gram_sizes))}, {attempt.seconds:.1f} s"
+        )
 
 
 def solve_ladder(

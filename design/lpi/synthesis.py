@@ -14,8 +14,8 @@ from design.lpi.achieved import Verification
 from design.lpi.dual import dual_pie, dual_structure
 from design.lpi.gains import Gain, gain_operator
 from design.lpi.inequality import Certificate, Inequality, dissipated_ends
-from design.lpi.result import Achieved, Attempt, Options, Progress, Result
-from design.lpi.rows import Structure, structure
+from design.lpi.result import Achieved, Attempt, Options, Progress, Result, Status
+from design.lpi.rows import Structure, build_rows, structure, unbounded
 from design.lpi.scaling import scaled
 from design.lpi.sdp import Point
 from design.lpi.search import Search, make_attempt, solve_ladder
@@ -32,8 +32,11 @@ def gain(pde: Pde, options: Options, progress: Progress) -> Result:
     if check.unstable():
         return unstable("gain", check)
     open_loop = check.open_loop()
-    search = Search("gain", options, progress, lower=finite(open_loop.value))
     pie = convert(pde)
+    refused = _refused("gain", pie, "bounded real lemma")
+    if refused is not None:
+        return replace(refused, achieved=open_loop)
+    search = Search("gain", options, progress, lower=finite(open_loop.value))
     _attempts(pie, structure(pie), search, measured=False, rate=check.slowest_rate())
     return bound("gain", search, open_loop, "bounded real lemma")
 
@@ -41,8 +44,11 @@ def gain(pde: Pde, options: Options, progress: Progress) -> Result:
 def observer(pde: Pde, options: Options, progress: Progress) -> Result:
     """An observer and the H-infinity norm of its error."""
     check = Verification(pde)
-    search = Search("observer", options, progress, lower=finite(check.optimum("observer")))
     pie = convert(pde)
+    refused = _refused("observer", pie, "observer LPI")
+    if refused is not None:
+        return refused
+    search = Search("observer", options, progress, lower=finite(check.optimum("observer")))
     _attempts(pie, structure(pie), search, measured=True, rate=check.slowest_rate())
     found, achieved = _gain_of(search, "observer", check)
     return bound("observer", search, achieved, "observer LPI", found)
@@ -64,12 +70,43 @@ def controller(pde: Pde, options: Options, progress: Progress) -> Result:
         shape = dual_structure(pie)
         formulation = f"dual LPI, u = K f on the highest derivatives: {reason}"
         progress(f"no adjoint system ({reason}): the usual dual LPI")
+    places = _unbounded(pie, shape)
+    if places:
+        scalars = [w.name for w in pde.disturbances if not w.distributed]
+        names = ", ".join(repr(scalars[k]) for k in places)
+        why = f"no adjoint system, as {reason}; " if reason else ""
+        return Result(
+            task="controller",
+            status=Status.UNRELIABLE,
+            message=f"no formulation: {why}the dual of disturbance {names} is an output that the dual dynamics "
+            "do not bound; profiles that vanish at the ends could be",
+            formulation=formulation,
+        )
     _attempts(pie, shape, search, measured=True, rate=check.slowest_rate())
     found, achieved = _gain_of(search, "controller", check, fundamental)
-    result = bound("controller", search, achieved, formulation, found)
-    if result.best is None and reason:
-        result = replace(result, message=f"{result.message}. No adjoint formulation: {reason}")
-    return result
+    return bound("controller", search, achieved, formulation, found)
+
+
+def _refused(task: str, pie: Pie, formulation: str) -> Result | None:
+    """The verdict if a regulated output is not bounded by what the dynamics dissipate, else None."""
+    places = _unbounded(pie, structure(pie))
+    outputs = [o for o in pie.pde.regulated if not o.distributed]
+    if not places:
+        return None
+    names = ", ".join(repr(outputs[k].expression.text) for k in places)
+    return Result(
+        task=task,
+        status=Status.UNRELIABLE,
+        message=f"no formulation: the regulated output {names} is not bounded by what the dynamics dissipate, "
+        "so no <x, P x> with bounded P can dominate it",
+        formulation=formulation,
+    )
+
+
+def _unbounded(pie: Pie, shape: Structure) -> list[int]:
+    degree = min(max(1, pie.C1.q1.shape[2]), 6)
+    ends = dissipated_ends(pie, shape, False)
+    return unbounded(pie.C1, build_rows(pie, shape, degree, None, ends).inequality)
 
 
 def _attempts(pie: Pie, shape: Structure, search: Search, *, measured: bool, rate: float) -> None:
