@@ -95,6 +95,17 @@ def multiply(left: Array, right: Array) -> Array:
     return np.asarray(np.einsum("mka,kna,pa->mnp", a, b, transform, optimize=True))
 
 
+@lru_cache(maxsize=512)
+def multiplication(weight: tuple[float, ...], size: int) -> Array:
+    """M[p, i]: coefficients of weight * phi_i for i < size; weight by its orthonormal coefficients."""
+    top = len(weight) + size - 1
+    nodes, _, transform = projection(top)
+    values = basis(nodes, len(weight)) @ np.array(weight)
+    out: Array = (transform * values) @ basis(nodes, size)
+    out.setflags(write=False)
+    return out
+
+
 def to_plain(coefficients: Array) -> Array:
     """Orthonormal coefficients (last axis) to those of plain P_i(2 s - 1), the artefact's basis."""
     return np.asarray(coefficients * np.sqrt(2.0 * np.arange(coefficients.shape[-1]) + 1.0))

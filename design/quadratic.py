@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from design import legendre
 from design.legendre import Array
 from design.operators import PIOperator, Shape, vertical
 
@@ -131,8 +132,14 @@ def coefficient_matrix(tables: list[FormTable]) -> Array:
 
 def weighted(rows: PIOperator, weight: Array) -> PIOperator:
     """Every row times the scalar polynomial `weight` (orthonormal coefficients)."""
-    count = rows.shape_out.functions
-    return PIOperator.multiplier(np.eye(count)[:, :, None] * weight) @ rows
+
+    def times(coefficients: Array) -> Array:
+        matrix = legendre.multiplication(tuple(weight), coefficients.shape[2])
+        return np.moveaxis(np.tensordot(coefficients, matrix, axes=(2, 1)), -1, 2)
+
+    return rows.replace(
+        q2=times(rows.q2), r0=times(rows.r0), r1=times(rows.r1), r2=times(rows.r2)
+    ).trimmed()
 
 
 def lifted(finite: PIOperator) -> PIOperator:
