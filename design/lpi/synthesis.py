@@ -33,11 +33,13 @@ def gain(pde: Pde, options: Options, progress: Progress) -> Result:
         return unstable("gain", check)
     open_loop = check.open_loop()
     pie = convert(pde)
-    refused = _refused("gain", pie, "bounded real lemma")
+    shape = structure(pie)
+    ends = dissipated_ends(pie, shape, False)
+    refused = _refused("gain", pie, shape, ends, "bounded real lemma")
     if refused is not None:
         return replace(refused, achieved=open_loop)
     search = Search("gain", options, progress, lower=finite(open_loop.value))
-    _attempts(pie, structure(pie), search, measured=False, rate=check.slowest_rate())
+    _attempts(pie, shape, ends, search, measured=False, rate=check.slowest_rate())
     return bound("gain", search, open_loop, "bounded real lemma")
 
 
@@ -45,11 +47,13 @@ def observer(pde: Pde, options: Options, progress: Progress) -> Result:
     """An observer and the H-infinity norm of its error."""
     check = Verification(pde)
     pie = convert(pde)
-    refused = _refused("observer", pie, "observer LPI")
+    shape = structure(pie)
+    ends = dissipated_ends(pie, shape, True)
+    refused = _refused("observer", pie, shape, ends, "observer LPI")
     if refused is not None:
         return refused
     search = Search("observer", options, progress, lower=finite(check.optimum("observer")))
-    _attempts(pie, structure(pie), search, measured=True, rate=check.slowest_rate())
+    _attempts(pie, shape, ends, search, measured=True, rate=check.slowest_rate())
     found, achieved = _gain_of(search, "observer", check)
     return bound("observer", search, achieved, "observer LPI", found)
 
@@ -70,7 +74,8 @@ def controller(pde: Pde, options: Options, progress: Progress) -> Result:
         shape = dual_structure(pie)
         formulation = f"dual LPI, u = K f on the highest derivatives: {reason}"
         progress(f"no adjoint system ({reason}): the usual dual LPI")
-    places = _unbounded(pie, shape)
+    ends = dissipated_ends(pie, shape, True)
+    places = _unbounded(pie, shape, ends)
     if places:
         scalars = [w.name for w in pde.disturbances if not w.distributed]
         names = ", ".join(repr(scalars[k]) for k in places)
@@ -82,14 +87,16 @@ def controller(pde: Pde, options: Options, progress: Progress) -> Result:
             "do not bound; profiles that vanish at the ends could be",
             formulation=formulation,
         )
-    _attempts(pie, shape, search, measured=True, rate=check.slowest_rate())
+    _attempts(pie, shape, ends, search, measured=True, rate=check.slowest_rate())
     found, achieved = _gain_of(search, "controller", check, fundamental)
     return bound("controller", search, achieved, formulation, found)
 
 
-def _refused(task: str, pie: Pie, formulation: str) -> Result | None:
+def _refused(
+    task: str, pie: Pie, shape: Structure, ends: PIOperator | None, formulation: str
+) -> Result | None:
     """The verdict if a regulated output is not bounded by what the dynamics dissipate, else None."""
-    places = _unbounded(pie, structure(pie))
+    places = _unbounded(pie, shape, ends)
     outputs = [o for o in pie.pde.regulated if not o.distributed]
     if not places:
         return None
@@ -103,16 +110,14 @@ def _refused(task: str, pie: Pie, formulation: str) -> Result | None:
     )
 
 
-def _unbounded(pie: Pie, shape: Structure) -> list[int]:
+def _unbounded(pie: Pie, shape: Structure, ends: PIOperator | None) -> list[int]:
     degree = min(max(1, pie.C1.q1.shape[2]), 6)
-    ends = dissipated_ends(pie, shape, False)
     return unbounded(pie.C1, build_rows(pie, shape, degree, None, ends).inequality)
 
 
 def _attempts(pie: Pie, shape: Structure, search: Search, *, measured: bool, rate: float) -> None:
     """Gain-type attempts of growing degree on the scaled PIE."""
     scale = scaled(pie)
-    ends = dissipated_ends(scale.pie, shape, measured)
     epsilon = margin(rate)
 
     def attempt(degree: int) -> tuple[Attempt, Certificate | None]:
