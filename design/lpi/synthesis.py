@@ -115,7 +115,15 @@ def _unbounded(pie: Pie, shape: Structure, ends: PIOperator | None) -> list[int]
     return unbounded(pie.C1, build_rows(pie, shape, degree, None, ends).inequality)
 
 
-def _attempts(pie: Pie, shape: Structure, search: Search, *, measured: bool, rate: float) -> None:
+def _attempts(
+    pie: Pie,
+    shape: Structure,
+    ends: PIOperator | None,
+    search: Search,
+    *,
+    measured: bool,
+    rate: float,
+) -> None:
     """Gain-type attempts of growing degree on the scaled PIE."""
     scale = scaled(pie)
     epsilon = margin(rate)
