@@ -120,6 +120,9 @@ def _figures(f: dict[str, Any]) -> list[tuple[str, str, str]]:
         out.append(("open loop", _number(f["open_loop"], "unstable"), f"the same without {what}"))
     if f["optimum"] is not None:
         out.append(("optimum", _number(f["optimum"]), _optimum(f)))
+    if f.get("gain"):
+        kind = "L, xh_t = A xh + L (C2 xh - y)" if "observer" in task else "K, u = K x"
+        out.append(("gain", f"norm {_number(f['gain']['norm'])}", f"{kind}; its kernels: --json"))
     if f["formulation"]:
         out.append(("formulation", f["formulation"], _program(f)))
     out.append(("time", f"{f['seconds']:.1f} s", _shares(f)))

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from design.lpi.gain_facts import gain_facts
 from design.lpi.reporter import Reporter
 from design.lpi.result import Attempt, Options, Result
 from design.pde.convert import convert
@@ -143,6 +144,7 @@ def facts(request: Request, result: Result, peak_memory_mb: float | None = None)
         "open_loop": achieved and achieved.open_loop,
         "optimum": achieved and achieved.optimum,
         "formulation": result.formulation,
+        "gain": result.gain and gain_facts(result.gain, request.problem.pde),
         "degree": best and best.degree,
         "sdp": {
             "gram_sizes": list(best.gram_sizes) if best else [],
