@@ -84,6 +84,13 @@ class Search:
             if _GROWTH * (time.perf_counter() - started) > self.remaining_s():
                 return
 
+    def replace(self, done: Attempt, certificate: Certificate | None) -> None:
+        """Take a further attempt for the best whatever its value, if it is certified."""
+        self.attempts.append(done)
+        if certificate is not None:
+            self.best = Certified(done, certificate)
+            self.progress(f"moderate gain: {self._line(done, True)}")
+
     def _tell(self, best: Attempt) -> None:
         """Hand the best so far to those who keep it."""
         if isinstance(self.progress, Reporter):

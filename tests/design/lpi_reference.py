@@ -30,7 +30,7 @@ DD, DN = ("x(0)", "x(1)"), ("x(0)", "x_s(1)")
 
 
 @cache
-def example(start: str) -> Pde:
+def example_problem(start: str) -> Pde:
     """The example problem whose file name begins so."""
     (path,) = EXAMPLES.glob(f"{start}_*.toml")
     return read_problem_file(path).pde
@@ -70,11 +70,17 @@ def heat(right: str = "x_ss + w", conditions: Sequence[str] = DN) -> Pde:
 
 
 def inequality(
-    pie: Pie, degree: int, *, measured: bool = False, channels: bool = True, lossless: bool = False
+    pie: Pie,
+    degree: int,
+    *,
+    measured: bool = False,
+    channels: bool = True,
+    lossless: bool = False,
+    with_ends: bool = True,
 ) -> Inequality:
-    """The engine's inequality, end values included."""
+    """The engine's inequality; the rows of end values may be left out where no program is solved."""
     shape = structure(pie)
-    ends = dissipated_ends(pie, shape, measured)
+    ends = dissipated_ends(pie, shape, measured) if with_ends else None
     return Inequality(
         pie, shape, degree, measured=measured, channels=channels, lossless=lossless, ends=ends
     )

@@ -9,7 +9,7 @@ from lpi_reference import (
     DD,
     admissible,
     combined,
-    example,
+    example_problem,
     functions_of,
     fundamental,
     heat,
@@ -45,7 +45,7 @@ NOTHING = np.zeros(0)
 CLAMPED_FREE = ("v(0)", "v_s(0)", "k(1)", "k_s(1)")
 BEAM = problem({"v": (2, "-k_ss"), "k": (2, "v_ss")}, CLAMPED_FREE)
 HEAT_DD = heat("x_ss + (1 + s)*x", DD)
-LUMPED = example("heat_lumped")
+LUMPED = example_problem("heat_lumped")
 
 
 class Sampled:
@@ -91,9 +91,9 @@ def kernel_rows(rows: Rows, pie: Pie, degree: int) -> PIOperator:
         (HEAT_DD, 3, False),
         (heat("(s**2 + 1)*x_ss + w"), 2, False),
         (BEAM, 2, False),
-        (example("n2"), 1, True),
+        (example_problem("n2"), 1, True),
         (LUMPED, 2, False),
-        (example("g20"), 1, False),
+        (example_problem("g20"), 1, False),
     ],
     ids=["heat DD", "heat DN, variable", "beam", "heat measured", "heat with ode", "transport"],
 )
