@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from design import legendre
-from design.inverse import SampledKernels, solve_gain
+from design.inverse import SINGULAR, SampledKernels, solve_gain
 from design.legendre import Array
 from design.operators import PIOperator, Shape, horizontal, vertical
 
@@ -47,7 +47,7 @@ def gain_operator(P: PIOperator, Z: PIOperator) -> tuple[PIOperator, float]:
     p, q1 = _finite_rows(P)
     z_rows = Z.rows(range(m), [])
     if not n:
-        return _matrix(np.linalg.inv(p.p)) @ z_rows, 0.0
+        return _inverse(p.p, p.p) @ z_rows, 0.0
     R = PIOperator(
         p=np.zeros((0, 0)),
         q1=np.zeros((0, n, 1)),
@@ -62,7 +62,7 @@ def gain_operator(P: PIOperator, Z: PIOperator) -> tuple[PIOperator, float]:
     column = PIOperator.zeros(Shape(0, n), Shape(m, 0)).replace(q2=P.q2)
     of_column, tail_column = _inverse_times(R, column)
     schur = p - q1 @ of_column
-    finite = _matrix(np.linalg.inv(schur.p)) @ (z_rows - q1 @ of_z)
+    finite = _inverse(schur.p, p.p) @ (z_rows - q1 @ of_z)
     return vertical(_as_rows(finite), of_z - of_column @ finite), max(tail_z, tail_column)
 
 
@@ -131,6 +131,14 @@ def _finite_rows(P: PIOperator) -> tuple[PIOperator, PIOperator]:
     matrix = _matrix(P.p)
     row = PIOperator.zeros(Shape(m, 0), Shape(0, n)).replace(q1=P.q1)
     return matrix, row
+
+
+def _inverse(schur: Array, block: Array) -> PIOperator:
+    """Of P's Schur complement on the ode states; ArithmeticError if it is rounding against P's own block."""
+    values = np.linalg.svd(schur, compute_uv=False)
+    if not values[-1] > SINGULAR * max(values[0], float(np.linalg.norm(block, 2))):
+        raise ArithmeticError("P is singular on the ode states: P is not coercive")
+    return _matrix(np.linalg.inv(schur))
 
 
 def _matrix(matrix: npt.ArrayLike) -> PIOperator:
