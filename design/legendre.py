@@ -15,7 +15,7 @@ from numpy.polynomial import legendre
 Array = npt.NDArray[np.float64]
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=512)
 def gauss(count: int) -> tuple[Array, Array]:
     """Gauss-Legendre nodes and weights on [0, 1], each of shape (count,)."""
     x, w = legendre.leggauss(count)
@@ -32,7 +32,7 @@ def basis(s: npt.ArrayLike, size: int) -> Array:
     return np.asarray(legendre.legvander(2.0 * points - 1.0, size - 1) * scale)
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=512)
 def projection(size: int) -> tuple[Array, Array, Array]:
     """Nodes, values and the exact transform for polynomials of degree below `size`.
 
@@ -47,7 +47,7 @@ def projection(size: int) -> tuple[Array, Array, Array]:
     return nodes, values, transform
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=512)
 def antiderivative_of_products(left: int, right: int, size: int) -> Array:
     """F[j, k, q]: coefficients of int_0^s phi_j phi_k, for j < left, k < right, in `size` basis functions.
 
@@ -62,7 +62,7 @@ def antiderivative_of_products(left: int, right: int, size: int) -> Array:
     return out
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=512)
 def integration(size_in: int, size_out: int) -> Array:
     """J[p, q]: coefficients of int_0^s phi_p; tridiagonal: only p-1, p+1 (and 0 for p = 0) appear."""
     out = np.zeros((size_in, max(size_out, size_in + 1)))
@@ -86,24 +86,31 @@ def fit(samples_of: npt.ArrayLike) -> Array:
     return np.asarray(samples @ transform.T)
 
 
-def multiply(left: Array, right: Array) -> Array:
-    """Product of matrix polynomials (m, k, p) and (k, n, q): shape (m, n, p + q - 1)."""
-    size = left.shape[2] + right.shape[2] - 1
-    nodes, _, transform = projection(size)
-    a = left @ basis(nodes, left.shape[2]).T
-    b = right @ basis(nodes, right.shape[2]).T
-    return np.asarray(np.einsum("mka,kna,pa->mnp", a, b, transform, optimize=True))
+@lru_cache(maxsize=512)
+def products(left: int, right: int) -> Array:
+    """M[i, j, p]: coefficients of phi_i phi_j for i < left, j < right; p < left + right - 1."""
+    size = left + right - 1
+    _, values, transform = projection(size)
+    out: Array = np.einsum("ai,aj,pa->ijp", values[:, :left], values[:, :right], transform)
+    out.setflags(write=False)
+    return out
 
 
 @lru_cache(maxsize=512)
-def multiplication(weight: tuple[float, ...], size: int) -> Array:
-    """M[p, i]: coefficients of weight * phi_i for i < size; weight by its orthonormal coefficients."""
-    top = len(weight) + size - 1
-    nodes, _, transform = projection(top)
-    values = basis(nodes, len(weight)) @ np.array(weight)
-    out: Array = (transform * values) @ basis(nodes, size)
+def products_with_antiderivatives(outer: int, left: int, right: int) -> Array:
+    """G[i, j, k, p]: coefficients of phi_i(s) int_0^s phi_j phi_k; p < outer + left + right - 1."""
+    primitive = antiderivative_of_products(left, right, left + right)
+    out = np.asarray(np.tensordot(products(outer, left + right), primitive, axes=(1, 2)))
+    out = np.ascontiguousarray(out.transpose(0, 2, 3, 1))
     out.setflags(write=False)
     return out
+
+
+def multiply(left: Array, right: Array) -> Array:
+    """Product of matrix polynomials (m, k, p) and (k, n, q): shape (m, n, p + q - 1)."""
+    table = products(left.shape[2], right.shape[2])
+    spread = np.tensordot(left, table, axes=(2, 0))  # (m, k, q, p + q - 1)
+    return np.asarray(np.tensordot(spread, right, axes=((1, 2), (0, 2))).transpose(0, 2, 1))
 
 
 def to_plain(coefficients: Array) -> Array:
@@ -122,11 +129,11 @@ def trim(coefficients: Array, axes: tuple[int, ...], tolerance: float = 0.0) -> 
 
     At least one coefficient stays. Non-finite coefficients are never dropped.
     """
-    out = coefficients
+    magnitudes = np.abs(coefficients)
+    keep = [slice(None)] * coefficients.ndim
     for axis in axes:
-        others = tuple(k for k in range(out.ndim) if k != axis % out.ndim)
-        largest = np.abs(out).max(axis=others, initial=0.0)
+        others = tuple(k for k in range(coefficients.ndim) if k != axis % coefficients.ndim)
+        largest = magnitudes.max(axis=others, initial=0.0)
         present = np.flatnonzero(~((largest <= tolerance) & np.isfinite(largest)))
-        keep = int(present[-1]) + 1 if present.size else 1
-        out = np.take(out, np.arange(keep), axis=axis)
-    return out
+        keep[axis] = slice(int(present[-1]) + 1 if present.size else 1)
+    return np.ascontiguousarray(coefficients[tuple(keep)])

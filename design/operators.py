@@ -258,7 +258,7 @@ def compose(a: PIOperator, b: PIOperator) -> PIOperator:
     x = _contract_with_primitive(difference_b, ja, b_side=True)
     y = _contract_with_primitive(difference_a, kb, b_side=False)
     shared = _kernel_product(a.r2, b.r1)
-    outer = np.einsum("qmi,mnj->qnij", a.q2, b.q1)
+    outer = np.tensordot(a.q2, b.q1, axes=(1, 0)).transpose(0, 2, 1, 3)
     r1 = _sum_all(
         _left_multiply(a.r0, b.r1), _right_multiply(a.r1, b.r0),
         _kernel_product(a.r1, x), _kernel_product(y, b.r1), shared, outer,
@@ -270,7 +270,7 @@ def compose(a: PIOperator, b: PIOperator) -> PIOperator:
     return PIOperator(
         p=a.p @ b.p + _inner(a.q1, b.q2),
         q1=_sum_all(
-            np.einsum("pm,mnd->pnd", a.p, b.q1), mul(a.q1, b.r0), _row_through_kernels(a.q1, b)
+            np.tensordot(a.p, b.q1, axes=1), mul(a.q1, b.r0), _row_through_kernels(a.q1, b)
         ),
         q2=_sum_all(
             np.einsum("qmd,mn->qnd", a.q2, b.p), mul(a.r0, b.q2), _kernels_on_column(a, b.q2)
@@ -284,8 +284,7 @@ def compose(a: PIOperator, b: PIOperator) -> PIOperator:
 def _kernels_on_column(a: PIOperator, column: Array) -> Array:
     """int_0^s A1(s,t) g(t) dt + int_s^1 A2(s,t) g(t) dt for g of shape (n, m, d)."""
     y = _contract_with_primitive(_padded_sum(a.r1, -a.r2), column.shape[2], b_side=False)
-    through = np.einsum("qnik,nmk->qmi", y, column)
-    return _padded_sum(through, _contract_degree(a.r2, column))
+    return _padded_sum(_contract_degree(y, column), _contract_degree(a.r2, column))
 
 
 def _row_through_kernels(row: Array, b: PIOperator) -> Array:
@@ -295,37 +294,37 @@ def _row_through_kernels(row: Array, b: PIOperator) -> Array:
 
 def _contract_degree(kernel: Array, column: Array) -> Array:
     size = min(kernel.shape[3], column.shape[2])
-    return np.asarray(np.einsum("qnik,nmk->qmi", kernel[..., :size], column[..., :size]))
+    pairs = np.tensordot(kernel[..., :size], column[..., :size], axes=((1, 3), (0, 2)))
+    return np.asarray(pairs.transpose(0, 2, 1))
 
 
 def _kernel_product(left: Array, right: Array) -> Array:
     """int_0^1 left(s, r) right(r, t) dr: contraction over the basis of r."""
+    if not (left.any() and right.any()):
+        return np.zeros((left.shape[0], right.shape[1], 1, 1))
     size = min(left.shape[3], right.shape[2])
-    return np.asarray(
-        np.einsum("qkij,knjl->qnil", left[..., :size], right[:, :, :size], optimize=True)
-    )
+    pairs = np.tensordot(left[..., :size], right[:, :, :size], axes=((1, 3), (0, 2)))
+    return np.asarray(pairs.transpose(0, 2, 1, 3))
 
 
 def _contract_with_primitive(kernel: Array, other: int, *, b_side: bool) -> Array:
     """X_j(t) (b_side) or Y_k(s): the kernel's inner basis index paired with int_0^. phi_j phi_k."""
+    if not kernel.any():
+        return np.zeros((*kernel.shape[:2], 1, 1))
     if b_side:
-        flipped = kernel.transpose(1, 0, 3, 2)
-        return _contract_with_primitive(flipped, other, b_side=False).transpose(1, 0, 3, 2)
-    outer, inner = kernel.shape[2], kernel.shape[3]
-    size = outer + inner + other - 1
-    nodes, _, transform = legendre.projection(size)
-    primitive = legendre.antiderivative_of_products(inner, other, inner + other)
-    f = primitive @ legendre.basis(nodes, inner + other).T
-    values = np.einsum("qnij,ai->qnja", kernel, legendre.basis(nodes, outer))
-    return np.asarray(np.einsum("qnja,jka,pa->qnpk", values, f, transform, optimize=True))
+        table = legendre.products_with_antiderivatives(kernel.shape[3], other, kernel.shape[2])
+        return np.asarray(np.tensordot(kernel, table, axes=((2, 3), (2, 0))))
+    table = legendre.products_with_antiderivatives(kernel.shape[2], kernel.shape[3], other)
+    return np.asarray(np.tensordot(kernel, table, axes=((2, 3), (0, 1))).swapaxes(2, 3))
 
 
 def _left_multiply(multiplier: Array, kernel: Array) -> Array:
-    size = multiplier.shape[2] + kernel.shape[2] - 1
-    nodes, _, transform = legendre.projection(size)
-    m = multiplier @ legendre.basis(nodes, multiplier.shape[2]).T
-    k = np.einsum("knij,ai->knaj", kernel, legendre.basis(nodes, kernel.shape[2]))
-    return np.asarray(np.einsum("qka,knaj,pa->qnpj", m, k, transform, optimize=True))
+    if not (multiplier.any() and kernel.any()):
+        return np.zeros((multiplier.shape[0], kernel.shape[1], 1, 1))
+    table = legendre.products(multiplier.shape[2], kernel.shape[2])
+    spread = np.tensordot(multiplier, table, axes=(2, 0))  # (q, k, i, p)
+    pairs = np.tensordot(spread, kernel, axes=((1, 2), (0, 2)))  # (q, p, n, j)
+    return np.asarray(pairs.transpose(0, 2, 1, 3))
 
 
 def _right_multiply(kernel: Array, multiplier: Array) -> Array:
@@ -336,7 +335,7 @@ def _right_multiply(kernel: Array, multiplier: Array) -> Array:
 
 def _inner(row: Array, column: Array) -> Array:
     size = min(row.shape[2], column.shape[2])
-    return np.asarray(np.einsum("pnd,nmd->pm", row[..., :size], column[..., :size]))
+    return np.asarray(np.tensordot(row[..., :size], column[..., :size], axes=((1, 2), (0, 2))))
 
 
 def _resize(coefficients: Array, size: int) -> Array:
@@ -348,17 +347,27 @@ def _resize(coefficients: Array, size: int) -> Array:
 
 def _common(arrays: Sequence[Array]) -> list[Array]:
     """Pad the degree axes (all from the third on) to a common size."""
-    target = [max(a.shape[axis] for a in arrays) for axis in range(2, arrays[0].ndim)]
-    return [
-        np.pad(a, [(0, 0), (0, 0), *((0, t - a.shape[i + 2]) for i, t in enumerate(target))])
-        for a in arrays
-    ]
+    target = _largest_degrees(arrays)
+    return [_sum_to(target, (a,)) if a.shape[2:] != target else a for a in arrays]
 
 
 def _padded_sum(a: Array, b: Array) -> Array:
-    left, right = _common([a, b])
-    return left + right
+    return a + b if a.shape == b.shape else _sum_to(_largest_degrees((a, b)), (a, b))
 
 
 def _sum_all(*arrays: Array) -> Array:
-    return np.asarray(np.sum(_common(arrays), axis=0))
+    return _sum_to(_largest_degrees(arrays), arrays)
+
+
+def _largest_degrees(arrays: Sequence[Array]) -> tuple[int, ...]:
+    return (
+        tuple(map(max, *(a.shape[2:] for a in arrays))) if len(arrays) > 1 else arrays[0].shape[2:]
+    )
+
+
+def _sum_to(degrees: tuple[int, ...], arrays: Sequence[Array]) -> Array:
+    out = np.zeros((*arrays[0].shape[:2], *degrees))
+    for a in arrays:
+        part: tuple[slice, ...] = (slice(None), slice(None), *map(slice, a.shape[2:]))
+        out[part] += a
+    return out

@@ -66,6 +66,8 @@ def test_cached_arrays_cannot_be_changed_by_callers() -> None:
         *legendre.projection(4),
         legendre.integration(3, 4),
         legendre.antiderivative_of_products(2, 3, 5),
+        legendre.products(2, 3),
+        legendre.products_with_antiderivatives(1, 2, 3),
     ]
     for array in cached:
         with pytest.raises(ValueError, match="read-only"):
@@ -126,6 +128,23 @@ def test_antiderivatives_of_products(left: int, right: int) -> None:
     padded = legendre.antiderivative_of_products(left, right, left + right + 3)
     np.testing.assert_allclose(padded[..., : left + right], table, atol=1e-15)
     assert not np.any(padded[..., left + right :])
+
+
+@pytest.mark.parametrize("sizes", [(1, 1, 1), (3, 1, 4), (2, 5, 3)])
+def test_products_and_products_with_antiderivatives(sizes: tuple[int, int, int]) -> None:
+    outer, left, right = sizes
+    unit = np.eye(max(sizes))
+    plain_table = legendre.products(left, right)
+    table = legendre.products_with_antiderivatives(outer, left, right)
+    assert plain_table.shape == (left, right, left + right - 1)
+    assert table.shape == (outer, left, right, sum(sizes) - 1)
+    for j in range(left):
+        for k in range(right):
+            product = series(unit[j]) * series(unit[k])
+            np.testing.assert_allclose(series(plain_table[j, k])(S), product(S), atol=1e-12)
+            for i in range(outer):
+                expected = series(unit[i])(S) * product.integ(lbnd=0.0)(S)
+                np.testing.assert_allclose(series(table[i, j, k])(S), expected, atol=1e-12)
 
 
 def test_products_of_matrix_polynomials() -> None:

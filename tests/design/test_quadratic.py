@@ -17,6 +17,7 @@ from pi_reference import (
     values,
 )
 
+from design import quadratic
 from design.operators import PIOperator, Shape
 from design.quadratic import (
     FormTable,
@@ -81,6 +82,26 @@ def test_forms_are_the_inner_products(space: Shape) -> None:
                 assert got == pytest.approx(expected, rel=1e-10, abs=1e-10)
 
 
+def test_rows_of_few_components_and_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Entries that are zero are left out and long products are cut into batches; the forms stay the same."""
+    space = Shape(2, 3)
+    left, right = rows(space, 4, 1), rows(space, 3, 2)
+    left.q2[1], left.r0[1], left.r1[1], left.r2[1] = 0.0, 0.0, 0.0, 0.0  # a row of zeros
+    left.q2[2], left.r1[2, :2], left.r2[2, 1] = 0.0, 0.0, 0.0
+    right.r0[0], right.q2[1, 0], right.r1[2], right.r2[2, 2] = 0.0, 0.0, 0.0, 0.0
+    whole = forms(left, right)
+    for x, y in vectors(space):
+        for a in range(4):
+            for b in range(3):
+                expected = product(left, a, right, b, x, y)
+                assert abs(expected) > 1e-6 or a == 1
+                got = table_value(whole, a, b, x, y)
+                assert got == pytest.approx(expected, rel=1e-10, abs=1e-10)
+    monkeypatch.setattr(quadratic, "_BATCH", 1)
+    one_by_one = coefficient_matrix([forms(left, right)])
+    np.testing.assert_allclose(one_by_one, coefficient_matrix([whole]), rtol=0.0, atol=1e-13)
+
+
 def test_forms_hold_self_adjoint_operators() -> None:
     """P and R0 of every entry are symmetric matrices: the part that is not carries no information."""
     table = forms(rows(Shape(2, 3), 2, 1), rows(Shape(2, 3), 2, 2))
@@ -113,6 +134,19 @@ def test_symmetric_trace_sum_and_scale(space: Shape) -> None:
                 assert got == pytest.approx(plus, rel=1e-9, abs=1e-9)
                 value = -2.5 * table_value(table, a, b, x, y) + table_value(other, a, b, x, y)
                 assert table_value(combined, a, b, x, y) == pytest.approx(value, rel=1e-9, abs=1e-9)
+
+
+def test_masked_and_repeated_tables() -> None:
+    table = forms(rows(Shape(1, 2), 2, 3), rows(Shape(1, 2), 3, 4))
+    keep = np.array([[True, False, True], [False, True, False]])
+    for name in ("p", "q", "r0", "r1"):
+        all_entries = getattr(table, name)
+        expected = np.where(keep.reshape(2, 3, *[1] * (all_entries.ndim - 2)), all_entries, 0.0)
+        np.testing.assert_array_equal(getattr(table.masked(keep), name), expected)
+        total = table.masked(keep).trace().repeated(4)
+        assert total.entries == (4, 1)
+        diagonal = sum(all_entries[a, a] for a in range(2) if keep[a, a])
+        np.testing.assert_allclose(getattr(total, name)[3, 0], diagonal, rtol=1e-14)
 
 
 def test_upper_triangle_represents_a_gram_matrix() -> None:
@@ -161,8 +195,10 @@ def test_columns_keep_the_order_of_the_entries() -> None:
 def test_rounding_is_no_equality() -> None:
     one = rows(Shape(0, 1), 1, 1)
     table = forms(one, one)
-    noisy = FormTable(table.p, table.q, table.r0, np.pad(table.r1, [(0, 0)] * 4 + [(0, 3), (0, 3)]))
-    noisy.r1[..., -1, -1] = 1e-16
+    kernels = np.pad(table.r1, [(0, 0)] * 4 + [(0, 3), (0, 3)])
+    kernels[..., -1, -1] = 1e-16
+    noisy = FormTable(table.p, table.q, table.r0, kernels)
+    np.testing.assert_array_equal(noisy.r1, kernels)
     assert coefficient_matrix([table]).shape == coefficient_matrix([noisy]).shape
 
 
@@ -199,6 +235,12 @@ def hilbert_schmidt(row: PIOperator) -> float:
         k = kernel_at(kernel, np.broadcast_to(s[:, None], t.shape), t)
         total += float(np.einsum("kaqn,kaqn,ka,k->", k, k, v, w))
     return float(np.sqrt(total))
+
+
+def test_only_functions_are_weighted() -> None:
+    numbers = random_operator(np.random.default_rng(3), Shape(1, 2), Shape(2, 2))
+    with pytest.raises(ValueError, match="only functions"):
+        weighted(numbers, np.ones(2))
 
 
 def test_unit_rows_have_norm_one() -> None:

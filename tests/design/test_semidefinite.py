@@ -8,7 +8,14 @@ import numpy.typing as npt
 import pytest
 from scipy import linalg
 
-from design.semidefinite import ACCEPTED, Layout, Program, Solution, solvers
+from design.semidefinite import (
+    ACCEPTED,
+    Layout,
+    Program,
+    Solution,
+    orthonormal_equalities,
+    solvers,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -210,3 +217,43 @@ def test_time_limit_gives_no_false_optimum(solver: str) -> None:
     assert solution.status != "optimal" or solution.residual < 1e-6
     if solution.status not in ACCEPTED:
         no_numbers(solution)
+
+
+def graded(values: Array, columns: int) -> Array:
+    """A matrix of these singular values with rows of equal length, so that scaling changes nothing.
+
+    Rotating by a Hadamard matrix spreads the singular values evenly over the rows.
+    """
+    right, _ = np.linalg.qr(np.random.default_rng(7).normal(size=(columns, values.size)))
+    return np.asarray(
+        linalg.hadamard(values.size) / np.sqrt(values.size) @ (values[:, None] * right.T)
+    )
+
+
+@pytest.mark.parametrize("columns", [16, 40])
+def test_equalities_are_an_orthonormal_basis_at_every_size_of_singular_values(columns: int) -> None:
+    """Down to the threshold 1e-7 of the largest, and without those below, whatever lies between."""
+    kept = [1.0, 0.9, 0.3, 1e-2, 1.1e-3, 0.9e-3, 1e-4, 1e-5, 1e-6, 2e-7]
+    matrix = graded(np.array([*kept, 4e-8, 1e-9, 1e-11, 0.0, 0.0, 0.0]), columns)
+    rows = orthonormal_equalities(matrix)
+    assert rows.shape == (len(kept), columns)
+    np.testing.assert_allclose(rows @ rows.T, np.eye(len(kept)), atol=1e-11)
+    _, values, right = np.linalg.svd(matrix, full_matrices=False)
+    for number, value in enumerate(values[: len(kept)]):
+        outside = right[number] - rows.T @ (rows @ right[number])
+        assert float(np.linalg.norm(outside)) < 1e-14 / value
+
+
+def test_equalities_of_more_rows_than_columns() -> None:
+    rng = np.random.default_rng(8)
+    matrix = rng.normal(size=(30, 4)) @ rng.normal(size=(4, 9))
+    rows = orthonormal_equalities(matrix)
+    assert rows.shape == (4, 9)
+    np.testing.assert_allclose(rows @ rows.T, np.eye(4), atol=1e-13)
+    np.testing.assert_allclose(matrix @ rows.T @ rows, matrix, atol=1e-12)
+
+
+def test_single_equality() -> None:
+    np.testing.assert_allclose(
+        np.abs(orthonormal_equalities(np.array([[3.0, -4.0]]))), [[0.6, 0.8]]
+    )
