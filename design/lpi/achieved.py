@@ -34,6 +34,7 @@ class Verification:
         self.pde = pde
         self.seconds = seconds
         self._systems: dict[int, System] = {}
+        self._optima: dict[tuple[str, int], float | None] = {}
 
     def system(self, size: int) -> System:
         """The matrices of this size. Raises ValueError if the PDE cannot be discretised."""
@@ -111,10 +112,12 @@ class Verification:
         value = float(np.trace(s.C1 @ X @ s.C1.T))
         return math.sqrt(value) if value > 0.0 else None
 
-    def optimum(self, role: str) -> float | None:
-        """The infimum of gamma over all gains, None where no Riccati equation gives it."""
+    def optimum(self, role: str, size: int = _OPTIMUM_SIZE) -> float | None:
+        """The infimum of gamma over all gains, infinite if none helps; None where no Riccati equation says."""
         of = observer_optimum if role == "observer" else controller_optimum
-        return of(self.system(_OPTIMUM_SIZE)).value
+        if (role, size) not in self._optima:
+            self._optima[role, size] = of(self.system(size)).value
+        return self._optima[role, size]
 
     def _refined(self, figure: Callable[[System], float]) -> Refined:
         return refine(lambda n: figure(self.system(n)), tolerance=TOLERANCE, seconds=self.seconds)

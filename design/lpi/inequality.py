@@ -11,7 +11,7 @@ and, as epsilon > 0, decay. The left side is a form in rows; its negative is a G
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -270,6 +270,7 @@ def dissipated_ends(pie: Pie, structure: Structure, measured: bool) -> PIOperato
     ends = structure.ends
     if ends is None:
         return None
+    structure = replace(structure, above=None)  # which are dissipated is asked without their help
     rows = build_rows(pie, structure, 1, pie.C2 if measured else None, ends)
     bounded = build_rows(pie, structure, 1, pie.C2 if measured else None).inequality
     inequality = unit_rows(vertical(bounded, ends))

@@ -10,7 +10,6 @@ import math
 from functools import cached_property
 
 import numpy as np
-from scipy import linalg
 
 from design.lpi.inequality import Certificate
 from design.lpi.rows import ENDS, family, functions, independent, stack, times
@@ -18,6 +17,9 @@ from design.lpi.sdp import GramProgram, Point
 from design.pde.convert import Pie
 from design.quadratic import coefficient_matrix, forms, unit_rows, weighted
 from design.semidefinite import Layout
+
+_NULL = 1e-7
+"""Relative size below which the denominator of a polynomial counts as zero."""
 
 
 class NormInequality:
@@ -61,15 +63,18 @@ class NormInequality:
         for size in sections:
             D = self.denominator.discretise(size, size + 8)
             N = self.numerator.discretise(size, size + 8)
-            scale = np.sqrt(np.sum(D**2, axis=0).clip(1e-300))
-            weight = (D / scale).T @ (D / scale)
-            bound = 0.0
+            scale = np.linalg.norm(D, axis=0)
+            scale = scale.clip(1e-6 * scale.max())
+            _, seen, axes = np.linalg.svd(D / scale, full_matrices=False)
+            there = seen > _NULL * seen[0]  # where D f = 0, N f must vanish as well
+            unit = (axes[there].T / seen[there]) / scale[:, None]  # columns with |D f| = 1
+            unseen = np.linalg.norm((N / scale) @ axes[~there].T)
+            bound = 0.0 if unseen <= _NULL * np.linalg.norm(N / scale) else math.inf
             if negative > 0.0 and rows is not None:
-                R = rows.discretise(size, size + 2 * self.degree + 8) / scale
-                bound = float(linalg.eigh(R.T @ R, weight, eigvals_only=True)[-1])
-            c2 = point.numbers["c2"] + max(negative, 0.0) * bound
-            form = (N / scale).T @ (N / scale) - c2 * weight
-            margins.append(-float(linalg.eigh(form, weight, eigvals_only=True)[-1]))
+                R = rows.discretise(size, size + 2 * self.degree + 8) @ unit
+                bound += float(np.linalg.norm(R, 2)) ** 2 * negative
+            c2 = point.numbers["c2"] + bound
+            margins.append(c2 - float(np.linalg.norm(N @ unit, 2)) ** 2)
             values.append(c2)
         change = abs(values[1] - values[0]) / max(abs(values[1]), 1e-300)
         return Certificate(

@@ -115,6 +115,8 @@ class Structure:
 
     levels: tuple[tuple[PIOperator, int], ...]
     ends: PIOperator | None
+    above: PIOperator | None = None
+    """The derivatives one above the levels: products with them are traded by parts, if ends are dissipated."""
 
 
 def build_rows(
@@ -142,6 +144,8 @@ def build_rows(
     allowed = [inequality]
     if measured is not None and measured.shape_out != Shape(0, 0):
         allowed.append(_nonempty(times(functions(measured), degree + 1)))
+    if ends is not None and structure.above is not None:
+        allowed.append(_nonempty(family(structure.above, degree)))
     multiples = stack(*(times(state.rows([], [i]), degree) for i in range(n)), times(ode, degree))
     candidates = kernels(state.rows([], range(n)), degree) if n else None
     smooth = _admissible(candidates, pie.A, vertical(*allowed)) if candidates else None
@@ -218,7 +222,14 @@ def flattened(rows: PIOperator) -> Array:
 
 def structure(pie: Pie) -> Structure:
     """Levels and end values of a PDE's own PIE."""
-    return Structure(levels=tuple(_levels(pie)), ends=_end_values(pie))
+    derivatives = {(i, j): row for i, j, row in pie.derivatives}
+    places = [
+        (i, dissipation_order(pie.pde, i) + 1)
+        for i, variable in enumerate(pie.pde.states)
+        if variable.order
+    ]
+    above = stack(*(derivatives[place] for place in places if place in derivatives))
+    return Structure(levels=tuple(_levels(pie)), ends=_end_values(pie), above=above)
 
 
 def _levels(pie: Pie) -> list[tuple[PIOperator, int]]:

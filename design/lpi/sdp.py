@@ -27,6 +27,8 @@ import numpy as np
 from design.legendre import Array
 from design.semidefinite import ACCEPTED, TIME_LIMITS, Layout, orthonormal_equalities
 
+_REDUCED = {"reduced_tol_gap_abs": 1e-1, "reduced_tol_gap_rel": 1e-1}
+"""Clarabel's last point counts as found within these, also where it ends in a numerical error."""
 _FORCED = 1e-8
 """A coordinate whose unit vector is this close to the row space is fixed by the equalities."""
 
@@ -298,7 +300,7 @@ class _DualModel:
         limit = TIME_LIMITS.get(solver)
         options = {limit: time_limit_s} if limit else {}
         if solver == "CLARABEL":
-            options["accept_unknown"] = True  # judged by the operators afterwards
+            options |= {"accept_unknown": True, **_REDUCED}  # judged by the operators afterwards
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # 'may be inaccurate': likewise
             try:

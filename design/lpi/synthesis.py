@@ -19,7 +19,7 @@ from design.lpi.rows import Structure, build_rows, structure, unbounded
 from design.lpi.scaling import scaled
 from design.lpi.sdp import Point
 from design.lpi.search import Search, make_attempt, solve_ladder
-from design.lpi.verdict import DELTA, bound, finite, margin, sound, unstable
+from design.lpi.verdict import DELTA, bound, finite, impossible, margin, sound, unstable
 from design.operators import PIOperator
 from design.pde.adjoint import NotAdjointable, dual_system
 from design.pde.convert import Pie, convert
@@ -35,6 +35,14 @@ def gain(pde: Pde, options: Options, progress: Progress) -> Result:
     if check.unstable():
         return unstable("gain", check)
     open_loop = check.open_loop()
+    if not math.isfinite(open_loop.value):
+        return Result(
+            task="gain",
+            status=Status.UNRELIABLE,
+            message="a mode neither grows nor decays: no strict inequality holds, and the gain may be infinite",
+            achieved=open_loop,
+            formulation="spectrum of the discretisation",
+        )
     pie = convert(pde)
     shape = structure(pie)
     ends = dissipated_ends(pie, shape, False)
@@ -49,6 +57,9 @@ def gain(pde: Pde, options: Options, progress: Progress) -> Result:
 def observer(pde: Pde, options: Options, progress: Progress) -> Result:
     """An observer and the H-infinity norm of its error."""
     check = Verification(pde)
+    hopeless = impossible("observer", check, "observer")
+    if hopeless is not None:
+        return hopeless
     pie = convert(pde)
     shape = structure(pie)
     ends = dissipated_ends(pie, shape, True)
@@ -64,6 +75,9 @@ def observer(pde: Pde, options: Options, progress: Progress) -> Result:
 def controller(pde: Pde, options: Options, progress: Progress) -> Result:
     """A state feedback and the H-infinity norm of the loop."""
     check = Verification(pde)
+    hopeless = impossible("controller", check, "controller")
+    if hopeless is not None:
+        return hopeless
     search = Search("controller", options, progress, lower=finite(check.optimum("controller")))
     fundamental, reason = None, ""
     try:

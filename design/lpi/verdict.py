@@ -25,12 +25,15 @@ def margin(rate: float) -> float:
 
 
 def sound(point: Point, found: Certificate) -> bool:
-    """Whether a certificate is more than rounding: P positive, the state's part strictly negative."""
+    """Whether a certificate is more than rounding: P positive, the state's part strictly negative.
+
+    A gamma must not change between the sections; where there is none, the sign of the margin is what counts.
+    """
     return (
         point.residual <= RESIDUAL_TOLERANCE
         and found.coercivity > 0.0
         and found.margin > 0.0
-        and found.change <= SECTION_TOLERANCE
+        and (found.change <= SECTION_TOLERANCE or math.isnan(found.gamma))
     )
 
 
@@ -81,6 +84,21 @@ def nothing(search: Search) -> str:
     return (
         f"no certificate up to degree {last.degree} within {search.options.time_limit_s:g} s; the last program "
         f"ended as '{last.solver_status}'. Try a higher --degree or a longer --time-limit"
+    )
+
+
+def impossible(task: str, check: Verification, role: str) -> Result | None:
+    """The verdict if no gain of any size reaches a finite norm on the discretisation, else None."""
+    values = [check.optimum(role, size) for size in (15, 23)]
+    if any(value is None or math.isfinite(value) for value in values):
+        return None
+    lacks = "detected from the outputs" if role == "observer" else "reached by the controls"
+    return Result(
+        task=task,
+        status=Status.INFEASIBLE,
+        message=f"no {role} reaches a finite gamma: a mode grows at {check.abscissa():.6g} per unit of time "
+        f"that cannot be {lacks}",
+        formulation="Riccati equation of the discretisation",
     )
 
 
