@@ -46,21 +46,24 @@ def problem(
     measured: Sequence[str] = (),
     norm: tuple[str, str] | None = None,
 ) -> Pde:
-    """A PDE from {state: (order, right-hand side)}, by way of a problem file."""
+    """A PDE from {state: (order, right-hand side)}, by way of a problem file; a norm (of, by) instead."""
 
     def listed(texts: Sequence[str]) -> str:
         return "[" + ", ".join(f'"{t}"' for t in texts) + "]"
 
-    states = [f"{x} = {o if isinstance(o, int) else repr(o)}" for x, (o, _) in equations.items()]
-    lines = [
-        *("[states]", *states),
-        *("[equations]", *(f'{x} = "{right}"' for x, (_, right) in equations.items() if right)),
-        *("[inputs]", f"disturbances = {listed(disturbances)}", f"controls = {listed(controls)}"),
-        *("[boundary]", f"conditions = {listed(conditions)}"),
-        *("[outputs]", f"regulated = {listed(regulated)}", f"measured = {listed(measured)}"),
+    lines = ["[states]"]
+    lines += [f"{x} = {o if isinstance(o, int) else repr(o)}" for x, (o, _) in equations.items()]
+    lines += [
+        "[inputs]",
+        f"disturbances = {listed(disturbances)}",
+        f"controls = {listed(controls)}",
     ]
     if norm:
         lines += ["[norm]", f'of = ["{norm[0]}"]', f'by = ["{norm[1]}"]']
+    else:
+        lines += ["[equations]", *(f'{x} = "{right}"' for x, (_, right) in equations.items())]
+    lines += ["[boundary]", f"conditions = {listed(conditions)}"]
+    lines += ["[outputs]", f"regulated = {listed(regulated)}", f"measured = {listed(measured)}"]
     return parse_problem("\n".join(lines) + "\n", "test").pde
 
 
