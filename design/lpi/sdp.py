@@ -193,8 +193,8 @@ class GramProgram:
             full[np.ix_(kept, kept)] = gram
             grams[name] = full
         columns = self._matrix[:, self._columns()]
-        largest = np.abs(columns * x).max()
-        residual = float(np.abs(columns @ x).max() / max(largest, 1e-300))
+        terms = np.abs(columns * x)
+        residual = float(np.abs(columns @ x).max() / max(terms.max(), 1e-300))
         free = x[1 + len(numbers) : self._head()]
         return replace(
             point,

@@ -103,6 +103,9 @@ def test_known_optimum(seed: int) -> None:
     assert point.residual == pytest.approx(
         np.abs(matrix @ x).max() / np.abs(matrix * x).max(), abs=1e-15
     )
+    spectra = [np.linalg.eigvalsh(g) for g in point.grams.values()]
+    smallest = min(0.0, *(v[0] for v in spectra)) / max(v[-1] for v in spectra)
+    assert point.smallest_eigenvalue == pytest.approx(float(smallest), rel=1e-6, abs=1e-14)
     assert point.smallest_eigenvalue > -1e-6
     assert point.iterations > 3
     assert min(point.modelling_s, point.solver_s) > 0.0
