@@ -88,13 +88,13 @@ def test_task_that_the_file_implies(case: str, tmp_path: Path) -> None:
 AMBIGUOUS = {
     "measured and controlled": (
         text(REGULATED, MEASURED, controls=True),
-        "stability, gain, observer, controller",
+        "stability, gain, observer, controller, h2, h2-observer",
     ),
     "disturbed only": (text(), "stability"),
     "equations and norm": (AUTONOMOUS + NORM, "stability, norm"),
     "everything": (
         text(REGULATED, MEASURED, NORM, controls=True),
-        "stability, gain, observer, controller, norm",
+        "stability, gain, observer, controller, norm, h2, h2-observer",
     ),
 }
 
