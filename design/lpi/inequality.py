@@ -264,30 +264,44 @@ class Inequality:
 def dissipated_ends(pie: Pie, structure: Structure, measured: bool) -> PIOperator | None:
     """End values whose squares some V can dissipate, as rows of constants; None if there are none.
 
-    Found by the equalities of the inequality of degree 1 alone: a square that no P can make is forced to zero,
-    and rows of that kind would only spoil the program (they are unbounded in the norm).
+    Found by the equalities of an inequality of low degree alone (higher where coefficients vary): a square that
+    no P can make is forced to zero, and rows of that kind would only spoil the program (they are unbounded in
+    the norm).
     """
     ends = structure.ends
     if ends is None:
         return None
     structure = replace(structure, above=None)  # which are dissipated is asked without their help
-    rows = build_rows(pie, structure, 1, pie.C2 if measured else None, ends)
-    bounded = build_rows(pie, structure, 1, pie.C2 if measured else None).inequality
+    degree = 1 + min((_coefficient_degree(pie) + 1) // 2, 3)
+    rows = build_rows(pie, structure, degree, pie.C2 if measured else None, ends)
+    bounded = build_rows(pie, structure, degree, pie.C2 if measured else None).inequality
     inequality = unit_rows(vertical(bounded, ends))
     P = rows.lyapunov
-    layout = Layout(
-        numbers=(),
-        free=0,
-        grams=(("P", P.shape_out.functions), ("inequality", inequality.shape_out.functions)),
-    )
-    nothing = forms(P @ pie.T, P @ pie.A).trace() * 0.0
-    matrix = coefficient_matrix(
-        [
-            nothing,
-            forms(P @ pie.T, P @ pie.A).symmetric().upper(0.5),
-            forms(inequality, inequality).upper(0.5),
-        ]
-    )
-    kept = GramProgram(matrix, layout).kept["inequality"] - bounded.shape_out.functions
+    power = forms(P @ pie.T, P @ pie.A)
+    tables = [power.trace() * 0.0, power.symmetric().upper(0.5)]
+    tables.append(forms(inequality, inequality).upper(0.5))
+    grams = [("P", P.shape_out.functions), ("inequality", inequality.shape_out.functions)]
+    for name, end in zip(("s", "1-s"), ENDS, strict=True):
+        # without the weights, a coefficient of odd degree would force squares, too
+        multiples = rows.lyapunov_multiples
+        if multiples is not None:
+            table = forms(weighted(multiples @ pie.T, end), multiples @ pie.A)
+            tables.append(table.symmetric().upper(0.5))
+            grams.append((f"P {name}", multiples.shape_out.functions))
+        multiples = rows.inequality_multiples
+        if multiples is not None:
+            tables.append(forms(weighted(multiples, end), multiples).upper(0.5))
+            grams.append((f"inequality {name}", multiples.shape_out.functions))
+    layout = Layout(numbers=(), free=0, grams=tuple(grams))
+    program = GramProgram(coefficient_matrix(tables), layout)
+    kept = program.kept["inequality"] - bounded.shape_out.functions
     places = [int(k) for k in kept if k >= 0]
     return ends.rows([], places) if places else None
+
+
+def _coefficient_degree(pie: Pie) -> int:
+    """By how many degrees in s A exceeds T: those of the PDE's coefficients, about."""
+    of_A, of_T = (
+        max(a.r0.shape[2], a.r1.shape[2], a.r2.shape[2], a.q2.shape[2]) for a in (pie.A, pie.T)
+    )
+    return int(max(of_A - of_T, 0))

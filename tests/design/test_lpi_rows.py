@@ -209,8 +209,12 @@ def not_kept(pde: Pde) -> Array:
     return np.asarray(np.linalg.norm(outside(flat[kept:], flat[:kept]), axis=1))
 
 
-def test_transport_loses_energy_where_it_leaves() -> None:
-    pde = problem({"x": (1, "-x_s")}, ("x(0)",), regulated=["x(1)"])
+@pytest.mark.parametrize(
+    "right", ["-x_s", "-x_s - (3 + 2*s)*x/10", "-(1 + s**2)*x_s + x", "-(1 + s**4)*x_s - s**3*x"]
+)
+def test_transport_loses_energy_where_it_leaves(right: str) -> None:
+    """Also with coefficients that vary: those of odd degree force no square."""
+    pde = problem({"x": (1, right)}, ("x(0)",), regulated=["x(1)"])
     ends = kept_ends(pde)
     assert ends is not None
     assert ends.shape_out == Shape(0, 1)
