@@ -220,6 +220,7 @@ def test_adjoint_that_does_not_exist() -> None:
 
 
 TOO_LARGE = Achieved(value=1e3, by_size=((15, 1e3),), converged=True)
+NO_NUMBER = Achieved(value=math.nan, by_size=((15, math.nan),), converged=False)
 UNSTABLE = Achieved(value=math.inf, by_size=((15, math.inf),), converged=False)
 
 
@@ -228,11 +229,12 @@ UNSTABLE = Achieved(value=math.inf, by_size=((15, math.inf),), converged=False)
     [
         ("n2", "loop", TOO_LARGE),
         ("n2", "loop", UNSTABLE),
+        ("n2", "loop", NO_NUMBER),
         ("g22", "open_loop", TOO_LARGE),
         ("o1", "norm", TOO_LARGE),
         ("o1", "norm", UNSTABLE),
     ],
-    ids=["loop", "unstable loop", "gain", "norm", "infinite norm"],
+    ids=["loop", "unstable loop", "loop without a number", "gain", "norm", "infinite norm"],
 )
 def test_contradiction_is_refused(
     name: str, figure: str, achieved: Achieved, monkeypatch: pytest.MonkeyPatch
