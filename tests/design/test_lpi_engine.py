@@ -151,6 +151,29 @@ def test_decay_is_certified(pde: Pde, decay: float | None) -> None:
         assert result.achieved.value == pytest.approx(-decay, rel=1e-8)
 
 
+@pytest.mark.parametrize(
+    "pde",
+    [
+        heat("x_ss + w", ("x_s(0)", "x_s(1)")),
+        problem({"X": ("ode", "0"), "Y": ("ode", "-Y")}),
+    ],
+    ids=["insulated heat", "integrator"],
+)
+def test_one_mode_that_stays(pde: Pde) -> None:
+    """Nothing grows, one mode does not decay, the others do: no form is conserved, none decreases strictly."""
+    result = solve(pde, "stability")
+    assert result.status is Status.CERTIFIED
+    assert "not asymptotically: a non-increasing" in result.message
+    assert result.best is not None and abs(result.best.margin) < 1e-5
+
+
+def test_slow_decay_is_decay() -> None:
+    result = solve(heat("x_ss - x/1000000 + w", ("x_s(0)", "x_s(1)")), "stability")
+    assert result.status is Status.CERTIFIED
+    assert "stable: a decreasing" in result.message
+    assert result.best is not None and result.best.margin > 0.0
+
+
 def test_ode_gain() -> None:
     """X'' + X'/2 + 2 X = w: the peak is at omega^2 = 2 - 1/8, 1/(d sqrt(k - d^2/4)) with k = 2, d = 1/2."""
     pde = problem(
