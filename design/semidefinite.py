@@ -20,8 +20,6 @@ ROW_FLOOR = 1e-5
 """Rows are scaled to norm one, but never by more than 1 / ROW_FLOOR: rounding must not become an equality."""
 RANK_TOLERANCE = 1e-7
 """Singular values of the scaled equalities below this (relative) are dependent rows."""
-_STRONG = 1e-3
-"""Singular values above this (relative) are resolved by the eigenvalues of the Gram matrix."""
 ACCEPTED = ("optimal", "optimal_inaccurate")
 TIME_LIMITS = {
     "CLARABEL": "time_limit",
@@ -167,25 +165,17 @@ class Program:
 def orthonormal_equalities(matrix: Array) -> Array:
     """An orthonormal basis of the matrix's row space, rows scaled first; rounding is no equality.
 
-    The basis are the right singular vectors. Those of large singular values come from the eigenvectors of the
-    small Gram matrix, which squares the condition, and one step of re-orthogonalisation; what is left, and
-    too small for that, from an SVD: as accurate as the SVD of everything, but several times faster.
+    The basis are the right singular vectors, largest singular value first: solvers are sensitive to more than
+    the space that they span. A QR factorisation leaves a small square matrix for the SVD.
     """
     norms = np.linalg.norm(matrix, axis=1)
     scaled = matrix / np.maximum(norms, ROW_FLOOR * norms.max())[:, None]
     if len(scaled) > scaled.shape[1]:
         scaled = np.linalg.qr(scaled, mode="r")
-    squares, left = np.linalg.eigh(scaled @ scaled.T)
-    floor = RANK_TOLERANCE * np.sqrt(squares[-1])
-    strong = squares > _STRONG**2 * squares[-1]
-    rows = (left[:, strong] / np.sqrt(squares[strong])).T @ scaled
-    rows -= 0.5 * (rows @ rows.T - np.eye(len(rows))) @ rows
-    rest = left[:, ~strong].T @ scaled
-    if np.linalg.norm(rest) > floor:
-        rest -= (rest @ rows.T) @ rows
-        _, values, weak = np.linalg.svd(rest, full_matrices=False)
-        rows = np.concatenate([rows, weak[values > floor]])
-    return np.asarray(rows)
+    basis, triangle = np.linalg.qr(scaled.T)
+    _, values, rotation = np.linalg.svd(triangle.T)
+    rank = int(np.count_nonzero(values > RANK_TOLERANCE * values[0]))
+    return np.asarray(rotation[:rank] @ basis.T)
 
 
 def _relative_smallest(gram: Array) -> float:
