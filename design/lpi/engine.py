@@ -19,6 +19,7 @@ from design.lpi.synthesis import controller, gain, observer
 from design.lpi.variance import h2, h2_observer
 from design.pde.convert import convert
 from design.pde.model import Pde
+from design.pde.problem_file import Task, check_task
 
 TASKS: dict[str, Callable[[Pde, Options, Progress], Result]] = {
     "stability": stability,
@@ -36,13 +37,14 @@ def solve(
 ) -> Result:
     """Answer one task: 'stability', 'gain', 'observer', 'controller', 'norm', 'h2' or 'h2-observer'.
 
-    Raises UsageError for ill-posed boundary conditions, ValueError for an unknown task or signals that the
-    task needs and the PDE lacks.
+    Raises UsageError for ill-posed boundary conditions or signals that the task needs and the PDE lacks,
+    ValueError for an unknown task.
     """
     options = options or Options()
     start = time.perf_counter()
     if task not in TASKS:
         raise ValueError(f"task {task!r}: expected one of {', '.join(TASKS)}")
+    check_task(pde, Task(task), pde.name or "the problem")
     convert(pde)  # ill-posed conditions are refused before anything else
     result = TASKS[task](pde, options, progress)
     return replace(result, seconds=time.perf_counter() - start)

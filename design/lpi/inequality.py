@@ -221,7 +221,10 @@ class Inequality:
             half = half + (self.weighed.adjoint @ self.weighed) * 0.5
         if sum(self._nz):
             half = half + self.z.adjoint @ self.z_of
-        found = [self._on_section(half, P, size) for size in sections]
+        try:
+            found = [self._on_section(half, P, size) for size in sections]
+        except linalg.LinAlgError:  # a norm too ill-conditioned to say anything
+            found = [(float("nan"), float("-inf"), float("-inf"))] * 2
         gammas = [f[0] for f in found]
         margins = [f[1] for f in found]
         values = gammas if self._finite + self._functions else margins

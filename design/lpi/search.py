@@ -98,7 +98,9 @@ class Search:
                 Result(
                     task=self.task,
                     status=Status.CERTIFIED,
-                    message=f"stopped; the best so far is of degree {best.degree}",
+                    message="stopped before the discretisation could confirm it; proven by the inequality of "
+                    "degree "
+                    f"{best.degree}",
                     gamma=None if self.task == "stability" else best.value,
                     best=best,
                     attempts=tuple(self.attempts),
@@ -123,6 +125,7 @@ def solve_ladder(
     judge: Callable[[Point], tuple[bool, Certificate]],
     *,
     options: Options,
+    positive: tuple[str, ...] = (),
     remaining_s: Callable[[], float],
     dump_name: str,
 ) -> tuple[Point, Certificate | None, bool, float, float, float]:
@@ -137,6 +140,7 @@ def solve_ladder(
         tried = program.solve(
             cost,
             fixed,
+            positive=positive,
             trace=trace,
             solver=options.solver,
             time_limit_s=max(remaining_s(), 1.0),

@@ -88,6 +88,7 @@ def _attempts(pde: Pde, search: Search, *, lossless: bool, neutral: bool, rate: 
             fixed,
             judge,
             options=search.options,
+            positive=("epsilon",) if "epsilon" not in fixed else (),
             remaining_s=search.remaining_s,
             dump_name=f"degree_{degree}",
         )

@@ -11,6 +11,9 @@ from design.lpi.result import Achieved, Result, Status
 from design.lpi.sdp import Point
 from design.lpi.search import RESIDUAL_TOLERANCE, SECTION_TOLERANCE, Search
 
+GRAM_TOLERANCE = 1e-4
+"""Negative eigenvalues of Gram matrices, relative, below which a point is no sum of squares at all: the
+operators alone, on sections, are then too little of a proof."""
 DELTA = 1e-3
 """P >= DELTA I, in the program's units."""
 MARGIN = 1e-5
@@ -31,6 +34,7 @@ def sound(point: Point, found: Certificate) -> bool:
     """
     return (
         point.residual <= RESIDUAL_TOLERANCE
+        and point.smallest_eigenvalue >= -GRAM_TOLERANCE
         and found.coercivity > 0.0
         and found.margin > 0.0
         and (found.change <= SECTION_TOLERANCE or math.isnan(found.gamma))
