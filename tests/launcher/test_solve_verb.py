@@ -243,7 +243,8 @@ def stand_in(start: Start, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Cli
 
 KEYS = {
     "task": str, "status": str, "gamma": float, "achieved": float, "limit": type(None), "seconds": float,
-    "sdp": dict, "formulation": str, "gain": type(None), "degree": int, "attempts": list, "open_loop": type(None),
+    "sdp": dict, "formulation": str,
+    "gain": type(None), "degree": int, "attempts": list, "open_loop": type(None),
     "optimum": float, "peak_memory_mb": float,
     "message": str, "problem": dict, "bisect": type(None),
     "achieved_by_size": list, "achieved_converged": bool, "seconds_by_part": dict,
