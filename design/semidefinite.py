@@ -27,6 +27,7 @@ TIME_LIMITS = {
     "MOSEK": "",
     "COPT": "",
     "CVXOPT": "",
+    "SDPA": "",
 }
 """CVXPY's solvers of semidefinite programs, and the option that limits their time where there is one."""
 
