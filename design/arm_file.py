@@ -12,7 +12,7 @@ from scipy.integrate import IntegrationWarning
 
 from design import legendre
 from design.setpoint import Setpoint, equilibrium_load, from_shape
-from wire.artefact import Arm
+from wire.artefact import ACTUATORS, SENSOR_SETS, Arm
 from wire.errors import UsageError
 
 FIRST_BENDING_ROOT = 1.8751040687119611
@@ -38,10 +38,26 @@ class Geometry(_Section, frozen=True):
 
 
 class Damping(_Section, frozen=True):
-    """Viscous drag per unit mass: give exactly one of the two."""
+    """Viscous drag per unit mass (give exactly one of the first two), and the material's own damping."""
 
     first_mode_damping_ratio: float | None = None
+    """Of the drag alone; Kelvin-Voigt damping comes on top."""
     drag_per_s: float | None = None
+    kelvin_voigt_s: float = 0.0
+    """Retardation time: stress E (strain + kelvin_voigt_s strain_t), axial and bending."""
+
+
+class Actuators(_Section, frozen=True):
+    """What the segments push with: `force` is "transverse" (along y of the fixed frame) or "normal" (along
+    the normal of the centre line where the segment is, whatever the arm's shape)."""
+
+    force: str = ACTUATORS[0]
+
+
+class Sensors(_Section, frozen=True):
+    """What a segment measures: ["v_y", "k"] or the curvature only, ["k"]."""
+
+    measured: list[str] = msgspec.field(default_factory=lambda: list(SENSOR_SETS[0]))
 
 
 class Weights(_Section, frozen=True):
@@ -79,12 +95,22 @@ class ArmFile(_Section, frozen=True):
     damping: Damping
     setpoints: list[SetpointEntry]
     weights: Weights = Weights()
+    actuators: Actuators = Actuators()
+    sensors: Sensors = Sensors()
 
     def arm(self) -> Arm:
-        """Material and geometry as the rest of the system uses them."""
+        """Material, geometry and options as the rest of the system uses them."""
         g, m = self.geometry, self.material
         undamped = Arm(
-            self.name, g.length_m, g.radius_m, m.youngs_modulus_pa, m.density_kg_per_m3, 0.0
+            name=self.name,
+            length_m=g.length_m,
+            radius_m=g.radius_m,
+            youngs_modulus_pa=m.youngs_modulus_pa,
+            density_kg_per_m3=m.density_kg_per_m3,
+            drag_per_s=0.0,
+            kelvin_voigt_s=self.damping.kelvin_voigt_s,
+            actuator=self.actuators.force,
+            measured=self.sensors.measured,
         )
         if self.damping.drag_per_s is not None:
             return msgspec.structs.replace(undamped, drag_per_s=self.damping.drag_per_s)
@@ -151,6 +177,7 @@ def check_arm_file(arm: ArmFile, where: str) -> None:
             f"arm file {where}: damping: expected exactly one of first_mode_damping_ratio and drag_per_s, "
             f"a positive number (an undamped arm has no certificate); got {given}"
         )
+    _check_options(arm, where)
     try:
         units = [arm.arm().drag_per_s, time_unit_s(arm.arm())]
     except (ValueError, OverflowError, ZeroDivisionError):
@@ -172,6 +199,25 @@ def check_arm_file(arm: ArmFile, where: str) -> None:
         with np.errstate(over="ignore", invalid="ignore"):
             _check_setpoint(entry, place, arm)
         _check_equilibrium(entry, place, arm)
+
+
+def _check_options(arm: ArmFile, where: str) -> None:
+    """UsageError for a damping time, a force or a sensor set that there is not."""
+    tau = arm.damping.kelvin_voigt_s
+    if not (math.isfinite(tau) and tau >= 0.0):
+        raise UsageError(
+            f"arm file {where}: damping.kelvin_voigt_s: expected a time in s, zero or positive, got {tau!r}"
+        )
+    if arm.actuators.force not in ACTUATORS:
+        raise UsageError(
+            f"arm file {where}: actuators.force: expected one of {', '.join(map(repr, ACTUATORS))}, got "
+            f"{arm.actuators.force!r}"
+        )
+    if tuple(arm.sensors.measured) not in SENSOR_SETS:
+        raise UsageError(
+            f"arm file {where}: sensors.measured: expected one of "
+            f"{', '.join(str(list(s)) for s in SENSOR_SETS)}, got {arm.sensors.measured}"
+        )
 
 
 def _check_setpoint(entry: SetpointEntry, where: str, arm: ArmFile) -> None:
@@ -239,6 +285,7 @@ def _unit_hint(message: str) -> str:
     known = {
         "length": "length_m", "radius": "radius_m", "youngs_modulus": "youngs_modulus_pa",
         "density": "density_kg_per_m3", "drag": "drag_per_s", "curvature": "curvature_per_m",
+        "kelvin_voigt": "kelvin_voigt_s",
     }  # fmt: skip
     for stem, key in known.items():
         if f"`{stem}" in message and f"`{key}`" not in message:

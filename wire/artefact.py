@@ -9,7 +9,7 @@ Conventions, for the deviation x = (v_x, v_y, e, k) from the setpoint (m/s, m/s,
 arclength s in [0, L] (theory, section 2):
 
     observer    xh_t = A xh + B u + L (C xh - y),   y = (v_y, k) in (m/s, 1/m)
-    controller  u = K xh,                           u = transverse force per length in N/m
+    controller  u = K xh,                           u = force per length in N/m, see `Arm.actuator`
 
 Polynomials are plain Legendre series in the variable 2 s / L - 1 (`numpy.polynomial.legendre`).
 """
@@ -28,7 +28,13 @@ import numpy.typing as npt
 from wire.errors import GainsRefusedError, UsageError
 
 FORMAT = "octarm-gains"
-VERSION = 1
+VERSION = 2
+OLDEST_VERSION = 1
+"""Version 1 had none of the arm's options; they are read from it with their defaults."""
+ACTUATORS = ("transverse", "normal")
+"""Directions of the commanded force: y of the fixed frame, or the normal of the deformed centre line."""
+SENSOR_SETS = (("v_y", "k"), ("k",))
+"""What a segment may measure: velocity and curvature, or the curvature only."""
 Array = npt.NDArray[np.float64]
 
 
@@ -42,6 +48,13 @@ class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     density_kg_per_m3: float
     drag_per_s: float
     """Viscous drag per unit mass: v_t = ... - drag v."""
+    kelvin_voigt_s: float = 0.0
+    """Retardation time: the stress is E (strain + kelvin_voigt_s strain_t), axial and bending."""
+    actuator: str = ACTUATORS[0]
+    """One of `ACTUATORS`: what the commanded force per length (of the arm at rest) points along."""
+    measured: list[str] = msgspec.field(default_factory=lambda: list(SENSOR_SETS[0]))
+    """One of `SENSOR_SETS`. y = (v_y, k) has both columns all the same: of a strain-only set the gains'
+    column of v_y is zero, so what stands there has no effect."""
 
     def __post_init__(self) -> None:
         for key in ("length_m", "radius_m", "youngs_modulus_pa", "density_kg_per_m3"):
@@ -50,6 +63,16 @@ class Arm(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"{key} must be a positive number, got {value!r}")
         if not (math.isfinite(self.drag_per_s) and self.drag_per_s >= 0.0):
             raise ValueError(f"drag_per_s must be zero or positive, got {self.drag_per_s!r}")
+        if not (math.isfinite(self.kelvin_voigt_s) and self.kelvin_voigt_s >= 0.0):
+            raise ValueError(
+                f"kelvin_voigt_s must be zero or positive, got {self.kelvin_voigt_s!r}"
+            )
+        if self.actuator not in ACTUATORS:
+            raise ValueError(
+                f"actuator must be one of {', '.join(ACTUATORS)}, got {self.actuator!r}"
+            )
+        if tuple(self.measured) not in SENSOR_SETS:
+            raise ValueError(f"measured must be one of {SENSOR_SETS}, got {self.measured!r}")
 
     @property
     def mass_per_length_kg_per_m(self) -> float:
@@ -144,7 +167,7 @@ class Setpoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     strain: list[float]
     """e_e(s), the equilibrium axial strain."""
     feedforward_n_per_m: list[float]
-    """f_e(s), the transverse load that holds the shape (theory, section 5)."""
+    """f_e(s), the load that holds the shape, along `Arm.actuator` (theory, section 5)."""
     tip_m: list[float]
     observer: OperatorFactors
     controller: OperatorFactors
@@ -239,9 +262,9 @@ def parse_artefact(raw: bytes, where: str) -> GainsArtefact:
         raise GainsRefusedError(
             f"{where}: expected format {FORMAT!r}, got {file.format!r}; {remedy}"
         )
-    if file.version != VERSION:
+    if not OLDEST_VERSION <= file.version <= VERSION:
         raise GainsRefusedError(
-            f"{where}: format version {file.version}, this octarm reads {VERSION}; {remedy}"
+            f"{where}: format version {file.version}, this octarm reads {OLDEST_VERSION} to {VERSION}; {remedy}"
         )
     sha = hashlib.sha256(bytes(file.content)).hexdigest()
     if sha != file.sha256:

@@ -75,6 +75,42 @@ def test_damping_ratio_is_that_of_the_first_bending_mode() -> None:
     assert arm.drag_per_s == pytest.approx(2.0 * 0.1 * frequency, rel=1e-12)
 
 
+def test_options_arrive_and_default_to_none(tmp_path: Path) -> None:
+    plain = read_arm_file(written(tmp_path, VALID)).arm()
+    assert (plain.kelvin_voigt_s, plain.actuator, plain.measured) == (
+        0.0,
+        "transverse",
+        ["v_y", "k"],
+    )
+    text = VALID.replace("drag_per_s = 0.03", "drag_per_s = 0.03\nkelvin_voigt_s = 0.25")
+    text = '[actuators]\nforce = "normal"\n[sensors]\nmeasured = ["k"]\n'.join(
+        [text[: text.index("[[setpoints]]")], text[text.index("[[setpoints]]") :]]
+    )
+    arm = read_arm_file(written(tmp_path, text)).arm()
+    assert (arm.drag_per_s, arm.kelvin_voigt_s) == (0.03, 0.25)
+    assert (arm.actuator, arm.measured) == ("normal", ["k"])
+
+
+@pytest.mark.parametrize(
+    ("place", "line", "culprit"),
+    [
+        ("[damping]", "kelvin_voigt_s = -0.1", "damping.kelvin_voigt_s"),
+        ("[damping]", "kelvin_voigt_s = nan", "damping.kelvin_voigt_s"),
+        ("[damping]", "kelvin_voigt = 0.1", "given in SI units as kelvin_voigt_s"),
+        ("[weights]", '[actuators]\nforce = "follower"', "actuators.force"),
+        ("[weights]", '[sensors]\nmeasured = ["k", "v_x"]', "sensors.measured"),
+        ("[weights]", "[sensors]\nmeasured = []", "sensors.measured"),
+    ],
+)
+def test_wrong_options_are_refused(tmp_path: Path, place: str, line: str, culprit: str) -> None:
+    text = VALID.replace(place, f"{place}\n{line}" if place == "[damping]" else f"{line}\n{place}")
+    path = written(tmp_path, text)
+    with pytest.raises(UsageError) as error:
+        read_arm_file(path)
+    assert str(path) in str(error.value)
+    assert culprit in str(error.value)
+
+
 def test_values_arrive(tmp_path: Path) -> None:
     file = read_arm_file(written(tmp_path, VALID))
     arm = file.arm()

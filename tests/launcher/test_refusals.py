@@ -100,7 +100,7 @@ def test_damaged_gains(start: Start, tmp_path: Path) -> None:
         ("edited", whole.replace(b'"radius_m":0.025', b'"radius_m":0.035')),
         ("empty", b""),
         ("noise", bytes(range(256))),
-        ("future", whole.replace(b'"version":1', b'"version":9')),
+        ("future", whole.replace(b'"version":2', b'"version":9')),
     ):
         path = tmp_path / f"{name}.json"
         path.write_bytes(content)

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from wire.artefact import (
     FORMAT,
+    OLDEST_VERSION,
     VERSION,
     Arm,
     Certificate,
@@ -254,9 +255,48 @@ def test_other_format_and_version() -> None:
         whole_file(content, format="octarm-run")
     )
     future = refusal(whole_file(b'{"of": "tomorrow"}', version=VERSION + 1))
-    assert f"format version {VERSION + 1}, this octarm reads {VERSION}" in future
+    assert (
+        f"format version {VERSION + 1}, this octarm reads {OLDEST_VERSION} to {VERSION}" in future
+    )
     assert "not a whole octarm gains file" in refusal(whole_file(content, version="1"))
     assert "unknown field `more`" in refusal(whole_file(content, more=1))
+
+
+def test_version_1_is_read_with_the_options_defaults() -> None:
+    """A file of the first version, as it was written then: no options in its arm."""
+    content = msgspec.to_builtins(artefact())
+    for option in ("kelvin_voigt_s", "actuator", "measured"):
+        del content["arm"][option]
+    old = parse_artefact(whole_file(json.dumps(content).encode(), version=1), "the file")
+    assert old == artefact()
+    assert (old.arm.kelvin_voigt_s, old.arm.actuator) == (0.0, "transverse")
+    assert old.arm.measured == ["v_y", "k"]
+
+
+def test_options_survive_the_file(tmp_path: Path) -> None:
+    arm = msgspec.structs.replace(ARM, kelvin_voigt_s=0.4, actuator="normal", measured=["k"])
+    wanted = msgspec.structs.replace(artefact(), arm=arm)
+    write_artefact(wanted, tmp_path / "a")
+    assert read_artefact(tmp_path / "a") == wanted
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("kelvin_voigt_s", -1e-9),
+        ("kelvin_voigt_s", math.inf),
+        ("actuator", "tangential"),
+        ("measured", []),
+        ("measured", ["k", "v_y"]),
+        ("measured", ["v_y"]),
+    ],
+)
+def test_options_that_there_are_not_are_refused(option: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=option):
+        msgspec.structs.replace(ARM, **{option: value})
+    if value != math.inf:
+        message = refusal(edited(lambda c: c["arm"].update({option: value})))
+        assert option in message
 
 
 BROKEN: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
