@@ -1,29 +1,20 @@
 """The command line of octarm: one verb a function; what a verb does lives in the rooms.
 
-Results go to standard output (with --json nothing but one JSON object), everything else to standard
-error. Exit codes: wire.errors.ExitCode.
+What goes where, and the exit codes: supervise.entry, wire.errors.ExitCode.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import signal
 import sys
-import tempfile
-import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+from typing import Annotated, Literal, NoReturn
 
 import tyro
 
+from supervise.entry import serve, show_json, teller
 from supervise.shipped import DEFAULT_ARM, DEFAULT_GAINS, SUITE
-from wire.errors import ExitCode, OctarmError, UsageError
-
-if TYPE_CHECKING:
-    from deploy import Deployment
-    from wire.artefact import Certificate
+from wire.errors import ExitCode, UsageError
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 Ints = Annotated[tuple[int, ...], tyro.conf.UseAppendAction]
@@ -118,9 +109,11 @@ def run(
     result = execute(options, quiet=quiet or json, plot=not no_plot)
     outcome = result.outcome
     if json:
-        _print_json(result.summary)
+        show_json(result.summary)
     else:
-        _print_summary(result.summary)
+        from analysis.render import report
+
+        print(report(result.summary), end="")
     if outcome.message:
         print(f"octarm run: {outcome.message}", file=sys.stderr)
         if result.recording.exists():
@@ -155,34 +148,20 @@ def design(
         raise UsageError(f"--out {out}: it exists already; give another name or --force")
     if not time_limit > 0.0:
         raise UsageError(f"--time-limit: expected a positive number of seconds, got {time_limit!r}")
+    from analysis.gain_table import gain_rows, gain_table
     from design.command import Options, run_design
 
-    silent = quiet or json
     artefact, digest = run_design(
         arm,
         out,
         Options(solver=solver, time_limit_s=time_limit),
-        lambda text: None if silent else print(text, file=sys.stderr, flush=True),
+        teller(silent=quiet or json),
     )
-    rows = [
-        {"setpoint": s.name, "role": role, **_gammas(getattr(s, f"{role}_certificate"))}
-        for s in artefact.setpoints
-        for role in ("observer", "controller")
-    ]
+    rows = gain_rows(artefact)
     if json:
-        _print_json({"artefact": str(out), "sha256": digest, "gains": rows})
+        show_json({"artefact": str(out), "sha256": digest, "gains": rows})
     else:
-        print(
-            f"{'setpoint':<10} {'gain':<11} {'certified':>9} {'achieved':>9} {'optimum':>8} "
-            f"{'open loop':>9} {'decay [1/s]':>11} {'gain norm':>9} {'seconds':>8}"
-        )
-        for row in rows:
-            print(
-                f"{row['setpoint']:<10} {row['role']:<11} {row['certified_gamma']:>9.4f} "
-                f"{row['achieved_gamma']:>9.4f} {row['optimum_gamma']:>8.4f} "
-                f"{row['open_loop_gamma']:>9.4f} {row['decay_per_s']:>11.4f} "
-                f"{row['gain_norm']:>9.2f} {row['seconds']:>8.1f}"
-            )
+        print(gain_table(rows))
         print(f"{out}, SHA-256 {digest[:16]}")
     return int(ExitCode.OK)
 
@@ -225,10 +204,7 @@ def solve(
     from supervise.solving import solve_in_child
     from supervise.suite import run_suite
 
-    def tell(text: str) -> None:
-        if not (quiet or json):
-            print(text, file=sys.stderr, flush=True)
-
+    tell = teller(silent=quiet or json)
     choices = Choices(task, bisect, settings, degree, time_limit, solver, dump_problem)
     if suite:
         if file is not None or choices != Choices(time_limit_s=time_limit, solver=solver):
@@ -236,7 +212,7 @@ def solve(
                 "--suite: takes --only, --time-limit and --solver, no file or other choice"
             )
         table = run_suite(read_suite(SUITE, only), SUITE.parent, choices, solve_in_child, tell)
-        _print_json(finite(table)) if json else print(suite_table(table), end="")
+        show_json(finite(table)) if json else print(suite_table(table), end="")
         refused, interrupted = not table["ok"], table["interrupted"]
     else:
         if file is None or only:
@@ -244,7 +220,7 @@ def solve(
                 "--only: is for --suite" if only else "FILE: expected a problem file, or --suite"
             )
         answer = solve_in_child(prepare(file, choices), tell)
-        _print_json(finite(answer.facts)) if json else print(answer_table(answer.facts), end="")
+        show_json(finite(answer.facts)) if json else print(answer_table(answer.facts), end="")
         refused, interrupted = answer.facts["status"] != "certified", answer.interrupted
     if interrupted:
         raise KeyboardInterrupt
@@ -271,7 +247,7 @@ def deploy(
         json: Print one JSON object instead of the table.
     """
     from deploy import deploy as deploy_gains
-    from supervise.factors_file import factors_json, facts
+    from supervise.factors_file import factors_json, facts, facts_table
     from wire.artefact import read_artefact
 
     if out is not None and out.exists():
@@ -284,10 +260,7 @@ def deploy(
         except OSError as error:
             raise UsageError(f"--out {out}: {error.strerror or error}") from None
         table["factors"] = str(out)
-    if json:
-        _print_json(table)
-    else:
-        _print_deployment(table, deployment)
+    show_json(table) if json else print(facts_table(table))
     return int(ExitCode.OK)
 
 
@@ -297,19 +270,15 @@ def doctor(*, json: Flag = False) -> int:
     Args:
         json: Print one JSON object instead of the table.
     """
-    from supervise.doctor import examine
+    from supervise.doctor import examine, report
 
     checks = examine()
     well = all(check.ok for check in checks)
     if json:
         listed = [vars(check) for check in checks]
-        _print_json({"ok": well, "checks": listed})
+        show_json({"ok": well, "checks": listed})
     else:
-        width = max(len(check.name) for check in checks)
-        for check in checks:
-            print(f"{'ok  ' if check.ok else 'FAIL'} {check.name:<{width}}  {check.found}")
-            if not check.ok:
-                print(f"     {'':<{width}}  {check.remedy}")
+        print(report(checks))
     return int(ExitCode.OK if well else ExitCode.INTERNAL)
 
 
@@ -324,76 +293,7 @@ VERBS: dict[str, Callable[..., int]] = {
 
 def main() -> NoReturn:
     """Entry point, see `octarm --help`."""
-    signal.signal(signal.SIGTERM, _interrupt)
-    try:
-        code: int = tyro.extras.subcommand_cli_from_dict(
-            VERBS, prog="octarm", description="A soft arm, one process a segment."
-        )
-    except OctarmError as error:
-        print(f"octarm: {error}", file=sys.stderr)
-        code = int(error.exit_code)
-    except KeyboardInterrupt:
-        print("octarm: interrupted", file=sys.stderr)
-        code = int(ExitCode.INTERRUPTED)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # nobody reads the output any more
-        code = int(ExitCode.OK)
-    except Exception as error:
-        code = int(ExitCode.INTERNAL)
-        print(f"octarm: internal error: {error!r}; {_save_traceback()}", file=sys.stderr)
-    sys.exit(code)
-
-
-def _interrupt(*_: object) -> NoReturn:
-    raise KeyboardInterrupt
-
-
-def _save_traceback() -> str:
-    try:
-        with tempfile.NamedTemporaryFile(
-            "w", prefix="octarm-error-", suffix=".txt", delete=False
-        ) as file:
-            traceback.print_exc(file=file)
-    except OSError:
-        return "its traceback could not be saved"
-    return f"the traceback is in {file.name}"
-
-
-def _print_json(value: dict[str, Any]) -> None:
-    print(json.dumps(value, allow_nan=False))
-
-
-def _print_summary(summary: dict[str, Any]) -> None:
-    if "ticks" not in summary:
-        return  # nothing was recorded
-    from analysis.render import render
-
-    print(render(summary))
-    print(f"{summary['ticks_per_s']:.0f} ticks/s, {summary['run_s']:.1f} s wall clock")
-    if summary["plot"]:
-        print(f"plot {summary['plot']}")
-
-
-def _gammas(certificate: Certificate) -> dict[str, Any]:
-    names = ("certified_gamma", "achieved_gamma", "open_loop_gamma", "optimum_gamma")
-    return {
-        name: getattr(certificate, name) for name in (*names, "decay_per_s", "gain_norm", "seconds")
-    }
-
-
-def _print_deployment(table: dict[str, Any], deployment: Deployment) -> None:
-    print(
-        f"{table['nodes']} nodes, tick {table['tick_s']:g} s, "
-        f"{table['messages_per_tick']} neighbour messages a tick, "
-        f"sweeps equal the dense step to {deployment.check:.1e}"
-    )
-    print(f"{'setpoint':<12} {'forward':>8} {'backward':>9} {'bytes':>12} {'radius':>9}")
-    for row in table["setpoints"]:
-        low, high = row["bytes_per_message"]
-        print(
-            f"{row['name']:<12} {row['rank_forward']:>8} {row['rank_backward']:>9} "
-            f"{f'{low}-{high}':>12} {row['spectral_radius']:>9.6f}"
-        )
+    serve(VERBS, "octarm", "A soft arm, one process a segment.")
 
 
 if __name__ == "__main__":

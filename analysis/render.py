@@ -31,6 +31,19 @@ def render(summary: dict[str, Any], width: int = WIDTH) -> str:
     return "\n".join([*lines, "", f"recording {summary['recording']} ({state})", ""])
 
 
+def report(summary: dict[str, Any]) -> str:
+    """What `octarm run` prints at its end: the table, the wall clock, the plot; "" if nothing was recorded."""
+    if "ticks" not in summary:
+        return ""
+    lines = [
+        render(summary),
+        f"{summary['ticks_per_s']:.0f} ticks/s, {summary['run_s']:.1f} s wall clock",
+    ]
+    if summary["plot"]:
+        lines.append(f"plot {summary['plot']}")
+    return "\n".join(lines) + "\n"
+
+
 def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
     """The rows of the table: (figure, value, meaning)."""
     seconds = s["ticks"] * s["tick_s"]

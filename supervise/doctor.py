@@ -11,7 +11,7 @@ import platform
 import socket
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -167,3 +167,14 @@ def _exchange() -> Check:
     ok = done.is_set() and count > 0
     half = 1e6 * seconds / max(1, 2 * count)
     return Check("exchange", ok, f"{count} round trips in {seconds:.2f} s, {half:.0f} us a message")
+
+
+def report(checks: Sequence[Check]) -> str:
+    """The checks as text: a line each, and below a failed one what to do."""
+    width = max(len(check.name) for check in checks)
+    lines = []
+    for check in checks:
+        lines.append(f"{'ok  ' if check.ok else 'FAIL'} {check.name:<{width}}  {check.found}")
+        if not check.ok:
+            lines.append(f"     {'':<{width}}  {check.remedy}")
+    return "\n".join(lines)

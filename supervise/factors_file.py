@@ -72,3 +72,20 @@ def facts(deployment: Deployment) -> dict[str, Any]:
         "largest_difference_to_dense": deployment.check,
         "setpoints": rows,
     }
+
+
+def facts_table(table: dict[str, Any]) -> str:
+    """The dictionary of `facts` as text."""
+    lines = [
+        f"{table['nodes']} nodes, tick {table['tick_s']:g} s, "
+        f"{table['messages_per_tick']} neighbour messages a tick, "
+        f"sweeps equal the dense step to {table['largest_difference_to_dense']:.1e}",
+        f"{'setpoint':<12} {'forward':>8} {'backward':>9} {'bytes':>12} {'radius':>9}",
+    ]
+    for row in table["setpoints"]:
+        low, high = row["bytes_per_message"]
+        lines.append(
+            f"{row['name']:<12} {row['rank_forward']:>8} {row['rank_backward']:>9} "
+            f"{f'{low}-{high}':>12} {row['spectral_radius']:>9.6f}"
+        )
+    return "\n".join(lines)

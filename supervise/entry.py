@@ -1,0 +1,72 @@
+"""The frame of the command line: picks the verb, turns what it raises into messages and exit codes.
+
+Between launcher.py, whose verbs say what is done, and the shell. Results go to standard output
+(with --json nothing but one JSON object), everything else to standard error.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn
+
+import tyro
+
+from wire.errors import ExitCode, OctarmError
+
+
+def serve(verbs: Mapping[str, Callable[..., int]], prog: str, description: str) -> NoReturn:
+    """Run the verb that the command line names; ends the process with its exit code."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        code: int = tyro.extras.subcommand_cli_from_dict(
+            dict(verbs), prog=prog, description=description
+        )
+    except OctarmError as error:
+        print(f"{prog}: {error}", file=sys.stderr)
+        code = int(error.exit_code)
+    except KeyboardInterrupt:
+        print(f"{prog}: interrupted", file=sys.stderr)
+        code = int(ExitCode.INTERRUPTED)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # nobody reads the output any more
+        code = int(ExitCode.OK)
+    except Exception as error:
+        code = int(ExitCode.INTERNAL)
+        print(f"{prog}: internal error: {error!r}; {_save_traceback()}", file=sys.stderr)
+    sys.exit(code)
+
+
+def show_json(value: Mapping[str, Any]) -> None:
+    """Print the one JSON object of --json; ValueError for a number that is not finite."""
+    print(json.dumps(value, allow_nan=False))
+
+
+def teller(*, silent: bool) -> Callable[[str], None]:
+    """Where a verb's progress goes: a line on standard error each, or nowhere."""
+
+    def tell(text: str) -> None:
+        if not silent:
+            print(text, file=sys.stderr, flush=True)
+
+    return tell
+
+
+def _interrupt(*_: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+def _save_traceback() -> str:
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="octarm-error-", suffix=".txt", delete=False
+        ) as file:
+            traceback.print_exc(file=file)
+    except OSError:
+        return "its traceback could not be saved"
+    return f"the traceback is in {file.name}"
