@@ -67,7 +67,8 @@ def run(
         noise_velocity: Standard deviation of the velocity sensors in m/s.
         noise_curvature: Standard deviation of the curvature sensors in 1/m.
         plant_cells: Cells of the emulated arm's own grid; default max(40, 4 nodes).
-        spacing: Where the segments end: equispaced or chebyshev.
+        spacing: Where the segments end: equispaced, chebyshev, or nodes + 1 boundaries in m from root to
+            tip, separated by commas or in a file.
         out: Directory for recording, plot and log, made if missing; default runs/<run id>.
         json: Print one JSON object instead of the table.
         no_plot: Make no plot.
@@ -242,17 +243,19 @@ def deploy(
         gains: Gains artefact, made by `octarm design`.
         nodes: Number of segments; at least 2.
         tick: Period of a tick in seconds.
-        spacing: Where the segments end: equispaced or chebyshev.
+        spacing: Where the segments end: equispaced, chebyshev, or nodes + 1 boundaries in m from root to
+            tip, separated by commas or in a file.
         out: File for every node's matrices as JSON, for other targets; must not exist.
         json: Print one JSON object instead of the table.
     """
     from deploy import deploy as deploy_gains
     from supervise.factors_file import factors_json, facts, facts_table
+    from supervise.spacing import parse_spacing
     from wire.artefact import read_artefact
 
     if out is not None and out.exists():
         raise UsageError(f"--out {out}: it exists already; nothing is written over")
-    deployment = deploy_gains(read_artefact(gains), nodes, tick, spacing)
+    deployment = deploy_gains(read_artefact(gains), nodes, tick, parse_spacing(spacing, nodes))
     table = facts(deployment)
     if out is not None:
         try:

@@ -13,6 +13,7 @@ import platform
 import secrets
 import time
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import metadata
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from plant.noise import SensorNoise
 from supervise.endpoints import Endpoints
 from supervise.factors_file import factors_json
 from supervise.shipped import DEFAULT_GAINS
+from supervise.spacing import parse_spacing, spacing_name
 from wire.artefact import GainsArtefact, digest, read_artefact
 from wire.channels import FORMAT_VERSION
 from wire.errors import UsageError
@@ -90,6 +92,12 @@ class RunOptions:
         DisturbanceSpec(self.disturbance, self.disturbance_amplitude)
         SensorNoise(self.seed, self.noise_velocity, self.noise_curvature)
         plant_cells(self.nodes, self.plant_cells)
+        _ = self.placed
+
+    @cached_property
+    def placed(self) -> str | tuple[float, ...]:
+        """The spacing's name, or its boundaries in m; a file is read once."""
+        return parse_spacing(self.spacing, self.nodes)
 
 
 def _at_least(name: str, value: int, least: int, why: str) -> None:
@@ -126,7 +134,7 @@ def prepare(options: RunOptions) -> tuple[GainsArtefact, Deployment]:
     """Read the gains and deploy them; raises UsageError or GainsRefusedError."""
     artefact = read_artefact(options.gains)
     artefact.setpoint_index(options.setpoint)
-    return artefact, deploy(artefact, options.nodes, options.tick_s, options.spacing)
+    return artefact, deploy(artefact, options.nodes, options.tick_s, options.placed)
 
 
 def make_plan(
@@ -144,7 +152,7 @@ def make_plan(
     run = RunConfig(
         run_id=run_id,
         nodes=nodes,
-        spacing=options.spacing,
+        spacing=spacing_name(options.placed),
         faces_m=tuple(deployment.faces_m.tolist()),
         tick_s=options.tick_s,
         ticks=options.ticks,
