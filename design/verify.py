@@ -8,7 +8,7 @@ value any gain could reach (Riccati).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,8 +39,8 @@ class Achieved:
 
 
 @dataclass(frozen=True)
-class _Plant:
-    """The arm on one grid in nondimensional Euclidean coordinates."""
+class ArmMatrices:
+    """The arm with its gains in nondimensional coordinates in which all norms are Euclidean."""
 
     A: Array
     disturbance: Array
@@ -51,8 +51,11 @@ class _Plant:
     K: Array
 
 
-def _plant(arm: Arm, setpoint: Setpoint, nodes: int) -> _Plant:
-    grid = make_grid(arm.length_m, nodes, "equispaced")
+def arm_matrices(
+    arm: Arm, setpoint: Setpoint, nodes: int, spacing: str | Sequence[float] = "equispaced"
+) -> ArmMatrices:
+    """Arm and gains of a setpoint on the segment grid of `deploy.make_grid`."""
+    grid = make_grid(arm.length_m, nodes, spacing)
     loop = make_loop(arm, setpoint, grid)
     length, time = arm.length_m, time_unit_s(arm)
     load = arm.bending_stiffness_n_m2 / length**3
@@ -69,7 +72,7 @@ def _plant(arm: Arm, setpoint: Setpoint, nodes: int) -> _Plant:
     outputs[0, 1::4] = np.sqrt(share[1::4])
     outputs[1, 3::4] = np.sqrt(share[3::4])
     force = time * scale[:, None] * loop.model.B / u_scale
-    return _Plant(
+    return ArmMatrices(
         A=time * scale[:, None] * loop.model.A / scale,
         disturbance=force @ np.sqrt(u_share)[:, None],
         force=force,
@@ -84,7 +87,7 @@ def _alpha2(arm: Arm) -> float:
     return arm.axial_stiffness_n * arm.length_m**2 / arm.bending_stiffness_n_m2
 
 
-def observer_channel(plant: _Plant, noise: float, *, closed: bool = True) -> Channel:
+def observer_channel(plant: ArmMatrices, noise: float, *, closed: bool = True) -> Channel:
     """Error e = xh - x: e_t = (A + L C) e - B w - rho L w_y, z = C1 e (chapter (17))."""
     if not closed:
         return Channel(plant.A, plant.disturbance, plant.outputs, np.zeros((2, 1)))
@@ -92,7 +95,7 @@ def observer_channel(plant: _Plant, noise: float, *, closed: bool = True) -> Cha
     return Channel(plant.A + plant.L @ plant.measure, B, plant.outputs, np.zeros((2, B.shape[1])))
 
 
-def controller_channel(plant: _Plant, effort: float, *, closed: bool = True) -> Channel:
+def controller_channel(plant: ArmMatrices, effort: float, *, closed: bool = True) -> Channel:
     """x_t = (A + B2 K) x + B w, z = (C1 x, effort K x) (chapter (20))."""
     if not closed:
         return Channel(plant.A, plant.disturbance, plant.outputs, np.zeros((2, 1)))
@@ -103,7 +106,7 @@ def controller_channel(plant: _Plant, effort: float, *, closed: bool = True) -> 
 def verify_observer(arm: Arm, setpoint: Setpoint, noise: float) -> Achieved:
     """Figures of the observer gain of a setpoint; `noise` is the weight of the measurement noise."""
 
-    def optimum(plant: _Plant) -> float:
+    def optimum(plant: ArmMatrices) -> float:
         return riccati_optimum(
             plant.A.T, plant.outputs.T, plant.disturbance.T, plant.measure.T, noise
         )
@@ -116,7 +119,7 @@ def verify_observer(arm: Arm, setpoint: Setpoint, noise: float) -> Achieved:
 def verify_controller(arm: Arm, setpoint: Setpoint, effort: float) -> Achieved:
     """Figures of the state-feedback gain of a setpoint; `effort` weighs the command in z."""
 
-    def optimum(plant: _Plant) -> float:
+    def optimum(plant: ArmMatrices) -> float:
         return riccati_optimum(plant.A, plant.disturbance, plant.outputs, plant.force, effort)
 
     return _verify(
@@ -127,10 +130,10 @@ def verify_controller(arm: Arm, setpoint: Setpoint, effort: float) -> Achieved:
 def _verify(
     arm: Arm,
     setpoint: Setpoint,
-    channel: Callable[[_Plant, bool], Channel],
-    optimum: Callable[[_Plant], float],
+    channel: Callable[[ArmMatrices, bool], Channel],
+    optimum: Callable[[ArmMatrices], float],
 ) -> Achieved:
-    plants = [_plant(arm, setpoint, nodes) for nodes in GRIDS]
+    plants = [arm_matrices(arm, setpoint, nodes) for nodes in GRIDS]
     closed = [channel(p, True) for p in plants]
     norms = [c.hinf_norm() for c in closed]
     extrapolated = norms[1] + (norms[1] - norms[0]) / 3.0
@@ -138,6 +141,6 @@ def _verify(
         gamma=max(norms[1], extrapolated),
         gamma_by_grid=tuple(norms),
         open_loop_gamma=channel(plants[0], False).hinf_norm(),
-        optimum_gamma=optimum(_plant(arm, setpoint, RICCATI_GRID)),
+        optimum_gamma=optimum(arm_matrices(arm, setpoint, RICCATI_GRID)),
         decay_per_s=min(c.decay() for c in closed) / time_unit_s(arm),
     )
