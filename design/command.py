@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -35,6 +35,8 @@ from design.semidefinite import solvers
 from design.setpoint import Setpoint, equilibrium_load, tip_position
 from design.verify import Achieved, verify_controller, verify_observer
 from wire.artefact import (
+    ACTUATORS,
+    SENSOR_SETS,
     Arm,
     Certificate,
     GainsArtefact,
@@ -131,28 +133,33 @@ def design_artefact(
     )
 
 
-def observer_problem(pie: ArmPIE, noise: float) -> HinfProblem:
-    """Estimate z = int (v_y, k) from y = (v_y, k) + noise under a uniform transverse load."""
+def observer_problem(
+    pie: ArmPIE, noise: float, measured: Sequence[str] = SENSOR_SETS[0]
+) -> HinfProblem:
+    """Estimate z = int (v_y, k) from the measured states + noise under a uniform transverse load."""
     return HinfProblem(
         T=pie.T,
         A=pie.A,
         krylov=pie.inverse(),
         B=functional("v_y").adjoint,
         C1=functional("v_y", "k"),
-        C2=selection("v_y", "k"),
+        C2=selection(*measured),
         rho=noise,
     )
 
 
-def controller_problem(pie: ArmPIE, effort: float) -> HinfProblem:
-    """State feedback u = f_y for z = (int (v_y, k), effort u): the observer of the adjoint system."""
+def controller_problem(pie: ArmPIE, effort: float, actuator: str = ACTUATORS[0]) -> HinfProblem:
+    """State feedback for z = (int (v_y, k), effort u) under a uniform transverse load.
+
+    It is the observer of the adjoint system from what the command works on: v_y, or the normal velocity.
+    """
     return HinfProblem(
-        T=pie.T,
+        T=pie.T_adjoint,
         A=pie.A_adjoint,
         krylov=pie.inverse(adjoint=True),
         B=functional("v_y", "k").adjoint,
         C1=functional("v_y"),
-        C2=selection("v_y"),
+        C2=pie.command(actuator),
         rho=effort,
     )
 
@@ -160,7 +167,8 @@ def controller_problem(pie: ArmPIE, effort: float) -> HinfProblem:
 def pie_at(arm: Arm, setpoint: Setpoint) -> ArmPIE:
     """The arm's partial integral equation at a setpoint."""
     cosine, sine = setpoint.frame(setpoint.frame_degree())
-    return arm_pie(cosine, sine, axial_ratio(arm), arm.drag_per_s * time_unit_s(arm))
+    unit = time_unit_s(arm)
+    return arm_pie(cosine, sine, axial_ratio(arm), arm.drag_per_s * unit, arm.kelvin_voigt_s / unit)
 
 
 def _design_setpoint(
@@ -172,8 +180,8 @@ def _design_setpoint(
     except ValueError as error:
         raise UsageError(f"arm file: {error}") from None
     problems: dict[Role, HinfProblem] = {
-        "observer": observer_problem(pie, file.weights.measurement_noise),
-        "controller": controller_problem(pie, file.weights.control_effort),
+        "observer": observer_problem(pie, file.weights.measurement_noise, arm.measured),
+        "controller": controller_problem(pie, file.weights.control_effort, arm.actuator),
     }
     gains = {
         role: _synthesise(problem, role, setpoint.name, options, progress)
