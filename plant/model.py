@@ -189,6 +189,18 @@ class ArmPlant:
         moved = half_decay * moved + (half / reach) * (kick + gain * next(accelerations))
         self._velocity = moved / step
 
+    @property
+    def state(self) -> Array:
+        """Positions in m, then velocities in m/s, x before y, of the grid nodes but the clamp, (4 cells,)."""
+        free = np.concatenate([self._position[1:], self._velocity])
+        return np.ascontiguousarray(free).view(np.float64)
+
+    @state.setter
+    def state(self, values: Array) -> None:
+        cells = self._grid.cells
+        free = np.ascontiguousarray(values, dtype=np.float64).reshape(4 * cells).view(np.complex128)
+        self._position[1:], self._velocity = free[:cells], free[cells:].copy()
+
     def measure(self) -> Array:
         """Noise-free sensors (n, 2): v_y in m/s at outer, curvature in 1/m at inner faces."""
         curvature = strains(self._position, self._grid).curvature_per_m

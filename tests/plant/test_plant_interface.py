@@ -167,3 +167,18 @@ def test_caller_may_reuse_the_command_array() -> None:
     plant.advance(command, 0)
     command[0] = float("nan")
     assert plant.first_non_finite() is None
+
+
+def test_a_plant_whose_state_is_put_back_moves_as_before() -> None:
+    plant, other = (ArmPlant(PlantParameters(CHAPTER_ARM, TEN, 0.5)) for _ in range(2))
+    push = np.linspace(-2e-3, 5e-3, 10)
+    for tick in range(4):
+        plant.advance(push, tick)
+    kept = plant.state
+    other.state = kept
+    for moving in (plant, other):
+        moving.advance(push, 4)
+    np.testing.assert_array_equal(other.state, plant.state)
+    assert np.abs(plant.state - kept).max() > 1e-6  # a copy: the arm went on, the kept one did not
+    x, y = plant.tip()
+    np.testing.assert_array_equal(plant.state[78:80], [x, y])
