@@ -126,8 +126,10 @@ def design(
     *,
     arm: Path = DEFAULT_ARM,
     out: Path | None = None,
+    jobs: int | None = None,
     solver: str = "CLARABEL",
     time_limit: float = 300.0,
+    fresh: Flag = False,
     force: Flag = False,
     json: Flag = False,
     quiet: Flag = False,
@@ -136,28 +138,25 @@ def design(
 
     Args:
         arm: Arm file (TOML): material, geometry, damping, setpoints, weights.
-        out: Gains artefact to write, default <name of the arm file>.gains.json in this folder; nothing
-            is written unless every gain is certified.
+        out: Gains artefact to write, default <name of the arm file>.gains.json in this folder; written
+            when every gain is certified. Until then finished gains are kept in <out>.parts, for the
+            next design.
+        jobs: Gains worked on at once, each in a process of its own; default: one a processor.
         solver: Semidefinite solver, by its name in CVXPY.
-        time_limit: Seconds for one semidefinite program.
+        time_limit: Seconds for one semidefinite program; a gain takes a few.
+        fresh: Design every gain, whatever is kept in <out>.parts.
         force: Write over an existing file.
         json: Print one JSON object instead of the table.
         quiet: No progress.
     """
-    out = out or Path(f"{arm.stem}.gains.json")
-    if out.exists() and not force:
-        raise UsageError(f"--out {out}: it exists already; give another name or --force")
-    if not time_limit > 0.0:
-        raise UsageError(f"--time-limit: expected a positive number of seconds, got {time_limit!r}")
     from analysis.gain_table import gain_rows, gain_table
-    from design.command import Options, run_design
+    from design.gain import Options
+    from supervise.designing import Request, run_design
 
-    artefact, digest = run_design(
-        arm,
-        out,
-        Options(solver=solver, time_limit_s=time_limit),
-        teller(silent=quiet or json),
-    )
+    out = out or Path(f"{arm.stem}.gains.json")
+    options = Options(solver=solver, time_limit_s=time_limit)
+    request = Request(arm, out, options, jobs, fresh=fresh, force=force)
+    artefact, digest = run_design(request, teller(silent=quiet or json))
     rows = gain_rows(artefact)
     if json:
         show_json({"artefact": str(out), "sha256": digest, "gains": rows})
@@ -285,11 +284,44 @@ def doctor(*, json: Flag = False) -> int:
     return int(ExitCode.OK if well else ExitCode.INTERNAL)
 
 
+def animate(
+    recording: tyro.conf.Positional[Path],
+    *,
+    out: Path | None = None,
+    fps: float = 15.0,
+    speed: float | None = None,
+    width: int = 480,
+    force: Flag = False,
+    json: Flag = False,
+    quiet: Flag = False,
+) -> int:
+    """Make a GIF of a run: true and estimated arm, reference and active setpoint over time.
+
+    Args:
+        recording: The recording, or the run's directory that holds it.
+        out: GIF to write, default arm.gif beside the recording.
+        fps: Frames a second of the film.
+        speed: Seconds of the arm's time in a second of the film; default: the film lasts 10 s.
+        width: Of the film in pixels.
+        force: Write over an existing file.
+        json: Print one JSON object instead of a line.
+        quiet: No progress.
+    """
+    from analysis.animate import Film, film_line
+    from analysis.animate import animate as make_film
+
+    progress = teller(silent=quiet or json)
+    facts = make_film(recording, out, Film(fps, speed, width), progress, force=force)
+    show_json(facts) if json else print(film_line(facts))
+    return int(ExitCode.OK)
+
+
 VERBS: dict[str, Callable[..., int]] = {
     "run": run,
     "design": design,
     "solve": solve,
     "deploy": deploy,
+    "animate": animate,
     "doctor": doctor,
 }
 

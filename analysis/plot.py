@@ -20,9 +20,9 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter
 
+from analysis.goals import setpoint_shape
 from analysis.open_loop import THRESHOLD, ErrorCourse, EstimationErrors, compare_with_open_loop
 from analysis.recording import Recording, read_recording
-from wire.artefact import Setpoint
 from wire.errors import UsageError
 
 Array = npt.NDArray[np.float64]
@@ -103,18 +103,6 @@ def title(recording: Recording) -> str:
     if recording.unfinished is not None:
         parts.append("recording unfinished")
     return "  ·  ".join(parts)
-
-
-def setpoint_shape(setpoint: Setpoint, length_m: float, points: int = 401) -> Array:
-    """Positions along the arm at the setpoint, (points, 2) in m, by integrating its curvature."""
-    s = np.linspace(0.0, length_m, points)
-    middle = 0.5 * (s[1:] + s[:-1])
-    x = 2.0 * middle / length_m - 1.0
-    legendre = np.polynomial.legendre
-    angle = legendre.legval(x, 0.5 * length_m * legendre.legint(setpoint.curvature_per_m, lbnd=-1))
-    stretched = (1.0 + legendre.legval(x, np.asarray(setpoint.strain))) * np.diff(s)
-    steps = stretched[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
 
 def telling_ticks(shapes: Array, count: int) -> list[int]:

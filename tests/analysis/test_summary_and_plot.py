@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from simulated_run import BYTES_PER_MESSAGE, Scenario, make_artefact, write_recording
 
-from analysis.plot import draw_run, plot_run, setpoint_shape, telling_ticks
+from analysis.goals import setpoint_shape
+from analysis.plot import draw_run, plot_run, telling_ticks
 from analysis.recording import read_recording
 from analysis.render import render
 from analysis.summary import summarise
