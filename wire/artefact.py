@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from wire.errors import GainsRefusedError, UsageError
+from wire.files import write_whole
 
 FORMAT = "octarm-gains"
 VERSION = 2
@@ -35,6 +36,8 @@ ACTUATORS = ("transverse", "normal")
 """Directions of the commanded force: y of the fixed frame, or the normal of the deformed centre line."""
 SENSOR_SETS = (("v_y", "k"), ("k",))
 """What a segment may measure: velocity and curvature, or the curvature only."""
+GAIN_SHAPES = {"observer": (4, 2), "controller": (1, 4)}
+"""Rows and columns of the two gains of a setpoint."""
 Array = npt.NDArray[np.float64]
 
 
@@ -130,7 +133,7 @@ class OperatorFactors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     n2b: PolynomialMatrix
 
 
-class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """What is known about one gain, and the evidence for it."""
 
     outcome: str
@@ -156,6 +159,9 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     solver: str
     solver_status: str
     seconds: float
+    """Of the whole gain: synthesis, factorisation and verification."""
+    open_loop_decay_per_s: float | None = None
+    """`decay_per_s` of the arm without the gain; artefacts of octarm 0.1 do not say."""
 
 
 class Setpoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -221,12 +227,7 @@ def write_artefact(artefact: GainsArtefact, path: Path) -> str:
     sha = hashlib.sha256(content).hexdigest()
     head = f'{{"format":"{FORMAT}","version":{VERSION},"sha256":"{sha}","content":'
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
-    try:
-        temporary.write_bytes(head.encode() + content + b"}\n")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_whole(path, head.encode() + content + b"}\n")
     return sha
 
 
@@ -297,18 +298,25 @@ def check(artefact: GainsArtefact, where: str) -> None:
                 raise GainsRefusedError(f"{place}.{key}: expected at least one number, got none")
         if len(setpoint.tip_m) != 2:
             raise GainsRefusedError(f"{place}.tip_m: expected 2 numbers, got {len(setpoint.tip_m)}")
-        _check_operator(setpoint.observer, 4, 2, f"{place}.observer")
-        _check_operator(setpoint.controller, 1, 4, f"{place}.controller")
-        for role in ("observer", "controller"):
-            certificate: Certificate = getattr(setpoint, f"{role}_certificate")
-            if certificate.outcome != "certified":
-                raise GainsRefusedError(
-                    f"{place}.{role}: its certificate says {certificate.outcome!r}, only 'certified' gains "
-                    "are run; run `octarm design` with other weights"
-                )
-            for key, value in msgspec.structs.asdict(certificate).items():
-                if isinstance(value, float):
-                    _finite(value, f"{place}.{role}_certificate.{key}")
+        for role in GAIN_SHAPES:
+            check_gain(
+                getattr(setpoint, role), getattr(setpoint, f"{role}_certificate"), role, place
+            )
+
+
+def check_gain(
+    factors: OperatorFactors, certificate: Certificate, role: str, place: str = "gain"
+) -> None:
+    """Refuse one gain with wrong shapes, non-finite numbers or no certificate; `place` begins the message."""
+    _check_operator(factors, *GAIN_SHAPES[role], f"{place}.{role}")
+    if certificate.outcome != "certified":
+        raise GainsRefusedError(
+            f"{place}.{role}: its certificate says {certificate.outcome!r}, only 'certified' gains "
+            "are run; run `octarm design` with other weights"
+        )
+    for key, value in msgspec.structs.asdict(certificate).items():
+        if isinstance(value, float):
+            _finite(value, f"{place}.{role}_certificate.{key}")
 
 
 def _check_operator(factors: OperatorFactors, outputs: int, inputs: int, place: str) -> None:

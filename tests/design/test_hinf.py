@@ -12,8 +12,8 @@ from beam_modes import Beam, beam, controller_optimum, norm, observer_optimum, s
 from pi_reference import finite_part, function_part, inner, polynomial, values
 
 from design.arm_pie import arm_pie
-from design.command import Role, controller_problem, observer_problem
 from design.factors import factorise
+from design.gain_problem import Role, controller_problem, observer_problem
 from design.hinf import (
     LPI_TOLERANCE,
     RESIDUAL_TOLERANCE,

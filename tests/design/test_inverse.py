@@ -11,7 +11,7 @@ from numpy.polynomial import legendre as plain
 from pi_reference import at, function_part, kernel_at, polynomial, random_operator, values
 
 from design.arm_pie import arm_pie
-from design.command import controller_problem, observer_problem
+from design.gain_problem import controller_problem, observer_problem
 from design.hinf import solve_hinf
 from design.inverse import SampledKernels, separate, solve_gain
 from design.operators import PIOperator, Shape

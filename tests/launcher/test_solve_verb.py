@@ -30,8 +30,9 @@ import launcher
 from design.pde.problem_file import Task
 from design.solve_command import Choices, Request, facts, finite, prepare
 from design.solve_suite import Row, read_suite
+from supervise.engine import EngineDiedError
 from supervise.shipped import EXAMPLES, SUITE
-from supervise.solving import Answer, EngineDiedError, peak_memory_mb, solve_in_child
+from supervise.solving import Answer, peak_memory_mb, solve_in_child
 from supervise.suite import run_suite
 from wire.errors import OctarmError, UsageError
 
