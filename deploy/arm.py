@@ -28,14 +28,16 @@ CELLS = 100
 
 @dataclass(frozen=True, eq=False)
 class ArmModes:
-    """The linear arm at a setpoint in its undamped modes: a_t = -drag a - w b + load u, b_t = w a.
+    """The linear arm at a setpoint in its undamped modes: a_t = -damping a - w b + load u, b_t = w a.
 
-    a and b are m amplitudes of velocity and strain, y = sense_a a + sense_b b in SI.
+    a and b are m amplitudes of velocity and strain, y = sense_a a + sense_b b in SI. The modes stay apart
+    with Kelvin-Voigt damping, which is tau w^2 in each.
     """
 
     frequency_rad_per_s: Array
     """w, (m,)."""
-    drag_per_s: float
+    damping_per_s: Array
+    """drag + tau w^2, (m,)."""
     load: Array
     """(m, n): from the commands in N/m, linear between the faces, constant on the first segment."""
     sense_a: Array
@@ -69,7 +71,7 @@ def make_arm_modes(arm: Arm, curvature_per_m: Sequence[float], grid: SegmentGrid
     sense = sensors.reshape(2 * n, size) / scale
     return ArmModes(
         frequency_rad_per_s=frequency,
-        drag_per_s=arm.drag_per_s,
+        damping_per_s=arm.drag_per_s + arm.kelvin_voigt_s * frequency**2,
         load=load,
         sense_a=sense[:, velocities] @ right.T,
         sense_b=sense[:, strains] @ left,
@@ -79,14 +81,19 @@ def make_arm_modes(arm: Arm, curvature_per_m: Sequence[float], grid: SegmentGrid
 def sample(modes: ArmModes, tick_s: float) -> tuple[Array, Array, Array]:
     """Exact motion over a tick with held commands: transition (2m, 2m), input (2m, n), y (2n, 2m).
 
-    Per mode with M = [[-drag, -w], [w, 0]] the transition is exp(h M) and the input M^-1 (exp(h M)
+    Per mode with M = [[-damping, -w], [w, 0]] the transition is exp(h M) and the input M^-1 (exp(h M)
     - I).
     """
-    w, d, h = modes.frequency_rad_per_s, modes.drag_per_s, tick_s
-    turn = np.sqrt((w**2 - 0.25 * d**2).astype(np.complex128))
-    fade = np.exp(-0.5 * d * h)
-    cosine = fade * np.cos(turn * h).real
-    sine = fade * (h * np.sinc(turn * h / np.pi)).real
+    w, d, h = modes.frequency_rad_per_s, modes.damping_per_s, tick_s
+    square = w**2 - 0.25 * d**2
+    turns = square >= 0.0
+    turn, fade = np.sqrt(np.where(turns, square, 0.0)), np.exp(-0.5 * d * h)
+    # exp(-d h / 2) times cosine and sine / turn. Where the mode creeps back without turning these are
+    # hyperbolic and may be out of range by themselves, so that the slower exponential is taken out.
+    creep = np.sqrt(np.where(turns, 1.0, -square))
+    slow, gap = np.exp(-h * w**2 / (0.5 * d + creep)), np.expm1(-2.0 * creep * h)
+    cosine = np.where(turns, fade * np.cos(turn * h), slow * (1.0 + 0.5 * gap))
+    sine = np.where(turns, fade * (h * np.sinc(turn * h / np.pi)), -0.5 * slow * gap / creep)
     aa, bb = cosine - 0.5 * d * sine, cosine + 0.5 * d * sine
     ba = w * sine
     by_a = ba / w

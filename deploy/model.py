@@ -4,7 +4,7 @@ Theory, section 2, in SI units and on the staggered grid of `deploy.grid`:
     v_t = N'/(rho A) - drag v + f/(rho A),   N = EA e t - EI k' n,   e_t = t.v',   k_t = (n.v')'.
 The discrete strain-rate operator G gives e_t and k_t; the velocities' rate is minus its adjoint in
 the energy inner product, so the conservative part A0 is skew by construction and conserves energy
-exactly.
+exactly. Kelvin-Voigt damping (e + tau e_t, k + tau k_t in N) adds -tau G* G to the velocities' rate.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import legendre
 
-from deploy.grid import MEASURED_STATES, Place, SegmentGrid
+from deploy.grid import COMMAND_PLACES, MEASURED_STATES, Place, SegmentGrid
 from wire.artefact import Arm
 
 Array = npt.NDArray[np.float64]
@@ -29,9 +29,11 @@ class GridModel:
     A0: Array
     """Conservative part, (4n, 4n): skew in the inner product sum(energy_weights * x * z)."""
     A: Array
-    """A0 minus the drag on the velocities, (4n, 4n), 1/s."""
+    """A0 minus the damping of the velocities: drag and tau G* G, (4n, 4n), 1/s."""
     B: Array
-    """Load per length to rate, (4n, n): 1/(rho A) in the rows of v_y."""
+    """Command to rate, (4n, n): direction of the actuator at the outer faces, over rho A."""
+    transverse: Array
+    """Load per length along y to rate, (4n, n): 1/(rho A) in the rows of v_y. B of a transverse actuator."""
     C: Array
     """Selects (v_y, k) of every node, (2n, 4n)."""
     energy_weights: Array
@@ -77,10 +79,19 @@ def make_model(arm: Arm, curvature_per_m: Sequence[float], grid: SegmentGrid) ->
         adjoint = rate.transpose(1, 2, 0) * weights[:, strain] / weights[:, :2, None]
         blocks[:, :2, :, strain] = -adjoint
     A0 = blocks.reshape(4 * n, 4 * n)
-    drag = np.tile([arm.drag_per_s, arm.drag_per_s, 0.0, 0.0], n)
-    B = np.zeros((4 * n, n))
-    B[1::4] = np.eye(n) / arm.mass_per_length_kg_per_m
+    A = A0 - np.diag(np.tile([arm.drag_per_s, arm.drag_per_s, 0.0, 0.0], n))
+    if arm.kelvin_voigt_s > 0.0:
+        velocity = np.flatnonzero(np.tile([True, True, False, False], n))
+        A[np.ix_(velocity, velocity)] += arm.kelvin_voigt_s * (A0 @ A0)[np.ix_(velocity, velocity)]
+    transverse = np.zeros((4 * n, n))
+    transverse[1::4] = np.eye(n) / arm.mass_per_length_kg_per_m
+    B = transverse
+    if arm.actuator == "normal":
+        turn = tangent_angle(curvature_per_m, grid.locations_m(COMMAND_PLACES[0]), grid.length_m)
+        B = np.zeros((4 * n, n))
+        B[0::4] = np.diag(-np.sin(turn)) / arm.mass_per_length_kg_per_m
+        B[1::4] = np.diag(np.cos(turn)) / arm.mass_per_length_kg_per_m
     C = np.zeros((2 * n, 4 * n))
     for row, component in enumerate(MEASURED_STATES):
         C[row::2, component::4] = np.eye(n)
-    return GridModel(A0=A0, A=A0 - np.diag(drag), B=B, C=C, energy_weights=weights)
+    return GridModel(A0=A0, A=A, B=B, transverse=transverse, C=C, energy_weights=weights)

@@ -18,7 +18,7 @@ from deploy.grid import COMMAND_PLACES, MEASUREMENT_PLACES, STATE_PLACES, make_g
 from deploy.step import make_loop
 from design.arm_file import time_unit_s
 from design.channel import Channel, riccati_optimum
-from wire.artefact import Arm, Setpoint
+from wire.artefact import SENSOR_SETS, Arm, Setpoint
 
 Array = npt.NDArray[np.float64]
 
@@ -72,15 +72,22 @@ def arm_matrices(
     outputs[0, 1::4] = np.sqrt(share[1::4])
     outputs[1, 3::4] = np.sqrt(share[3::4])
     force = time * scale[:, None] * loop.model.B / u_scale
+    transverse = time * scale[:, None] * loop.model.transverse / u_scale
+    sensors = measured_rows(arm, nodes)
     return ArmMatrices(
         A=time * scale[:, None] * loop.model.A / scale,
-        disturbance=force @ np.sqrt(u_share)[:, None],
+        disturbance=transverse @ np.sqrt(u_share)[:, None],
         force=force,
         outputs=outputs,
-        measure=y_scale[:, None] * loop.model.C / scale,
-        L=time * scale[:, None] * loop.L / y_scale,
+        measure=(y_scale[:, None] * loop.model.C / scale)[sensors],
+        L=(time * scale[:, None] * loop.L / y_scale)[:, sensors],
         K=u_scale[:, None] * loop.K / scale,
     )
+
+
+def measured_rows(arm: Arm, nodes: int) -> npt.NDArray[np.bool_]:
+    """Which of the 2n rows (v_y, k) of C, and columns of L, the arm has sensors for, shape (2n,), bool."""
+    return np.tile([name in arm.measured for name in SENSOR_SETS[0]], nodes)
 
 
 def _alpha2(arm: Arm) -> float:

@@ -1,5 +1,6 @@
 """The arm behind the stability check: exact sampling, the loop against a plain simulation."""
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -16,14 +17,17 @@ from deploy.step import make_loop, make_step
 Array = npt.NDArray[np.float64]
 
 
-@pytest.mark.parametrize("drag", [0.0, 0.02, 3.0])
-def test_sampling_is_the_matrix_exponential(drag: float) -> None:
+@pytest.mark.parametrize(
+    ("drag", "retardation"), [(0.0, 0.0), (0.02, 0.0), (3.0, 0.0), (0.02, 0.8)]
+)
+def test_sampling_is_the_matrix_exponential(drag: float, retardation: float) -> None:
     frequency = np.array([0.05, 1.5, 40.0])  # overdamped, and the critical one, at drag 3
     load = np.array([[1.0], [2.0], [-1.0]])
-    modes = ArmModes(frequency, drag, load, np.ones((1, 3)), 2.0 * np.ones((1, 3)))
+    damping = drag + retardation * frequency**2
+    modes = ArmModes(frequency, damping, load, np.ones((1, 3)), 2.0 * np.ones((1, 3)))
     transition, force, sense = sample(modes, 0.3)
     for i, w in enumerate(frequency):
-        held = np.array([[-drag, -w, load[i, 0]], [w, 0.0, 0.0], [0.0, 0.0, 0.0]])
+        held = np.array([[-damping[i], -w, load[i, 0]], [w, 0.0, 0.0], [0.0, 0.0, 0.0]])
         exact = expm(0.3 * held)
         pair = np.ix_([i, 3 + i], [i, 3 + i])
         np.testing.assert_allclose(transition[pair], exact[:2, :2], atol=1e-12)
@@ -80,6 +84,37 @@ def test_the_check_sees_what_the_model_does_not() -> None:
     assert radius.controlled_state < 1.0
     assert radius.arm > 1.0
     assert not radius.stable
+
+
+def test_the_creep_of_overdamped_modes_is_sampled_without_overflow() -> None:
+    """Far above critical the strain relaxes as exp(-t / tau), the velocity has gone at once."""
+    w, tau, h = np.array([300.0]), 0.5, 0.1
+    one = np.ones((1, 1))
+    transition, force, _ = sample(ArmModes(w, tau * w**2, one, one, one), h)
+    assert transition[1, 1] == pytest.approx(np.exp(-h / tau), rel=1e-3)
+    assert abs(transition[0, 0]) < 1e-4
+    assert force[1, 0] == pytest.approx((1.0 - np.exp(-h / tau)) / w[0], rel=1e-3)
+
+
+def test_modes_of_an_arm_with_kelvin_voigt_damping_and_normal_actuators() -> None:
+    """The same eigenvalues and the same response as the model in its own coordinates."""
+    arm = msgspec.structs.replace(ARM, kelvin_voigt_s=0.3, actuator="normal")
+    grid = make_grid(ARM.length_m, 9, "equispaced")
+    modes = make_arm_modes(arm, CURVED, grid)
+    fine = SegmentGrid(np.linspace(0.0, ARM.length_m, 4 * 9 + 1))
+    model = make_model(arm, CURVED, fine)
+    w, d = modes.frequency_rad_per_s, modes.damping_per_s
+    roots = np.concatenate([np.roots([1.0, b, a * a]) for a, b in zip(w, d, strict=True)])
+    found = np.linalg.eigvals(model.A)
+    np.testing.assert_allclose(np.sort(found.real), np.sort(roots.real), rtol=1e-6, atol=1e-8)
+    # static response y = -C A^-1 B u to one command, by the modes: w b = load u, a = 0
+    hat = np.interp(fine.faces_m, grid.faces_m, np.eye(10)[4])[1:]
+    state = -np.linalg.solve(model.A, model.B @ hat)
+    np.testing.assert_allclose(
+        modes.sense_b @ (modes.load[:, 3] / w),
+        state.reshape(9, 4, 4)[:, [3, 0], [1, 3]].ravel(),
+        atol=1e-9 * np.abs(state).max(),
+    )
 
 
 def test_many_segments_are_divided_less() -> None:

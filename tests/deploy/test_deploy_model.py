@@ -2,6 +2,7 @@
 
 import math
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -41,6 +42,41 @@ def test_drag_acts_on_velocities_only_and_load_on_transverse_velocity() -> None:
     expected = np.zeros((3, 4, 3))
     expected[[0, 1, 2], 1, [0, 1, 2]] = 1.0 / (1050.0 * math.pi * 0.03**2)
     np.testing.assert_allclose(model.B, expected.reshape(12, 3), rtol=1e-14)
+
+
+@pytest.mark.parametrize("spacing", ["equispaced", UNEVEN])
+def test_kelvin_voigt_damping_takes_the_energy_of_the_strain_rates(
+    spacing: str | list[float],
+) -> None:
+    """It is the strain energy of the velocities, times 2 tau, and acts on velocities only."""
+    tau = 0.4
+    grid = make_grid(ARM.length_m, 6, spacing)
+    damped = make_model(msgspec.structs.replace(ARM, kelvin_voigt_s=tau), CURVED, grid)
+    plain = make_model(ARM, CURVED, grid)
+    added = (damped.A - plain.A).reshape(6, 4, 6, 4)
+    assert not added[:, 2:].any() and not added[:, :, :, 2:].any()
+    np.testing.assert_array_equal(damped.A0, plain.A0)
+    x = np.random.default_rng(5).standard_normal((6, 4))
+    power = 2.0 * np.sum(damped.energy_weights * x * np.einsum("icjd,jd->ic", added, x))
+    angle = tangent_angle(CURVED, grid.centres_m, ARM.length_m)
+    assert power == pytest.approx(-2.0 * tau * strain_energy(grid, angle, x[:, :2]), rel=1e-12)
+    weighted = damped.energy_weights.ravel()[:, None] * (damped.A - plain.A)
+    np.testing.assert_allclose(weighted, weighted.T, atol=1e-13 * np.abs(weighted).max())
+
+
+def test_normal_actuators_push_across_the_setpoint() -> None:
+    grid = make_grid(ARM.length_m, 5, "chebyshev")
+    model = make_model(msgspec.structs.replace(ARM, actuator="normal"), CURVED, grid)
+    plain = make_model(ARM, CURVED, grid)
+    np.testing.assert_array_equal(model.transverse, plain.B)
+    np.testing.assert_array_equal(model.A, plain.A)
+    angle = tangent_angle(CURVED, grid.faces_m[1:], ARM.length_m)
+    assert np.ptp(angle) > 0.3
+    push = ARM.mass_per_length_kg_per_m * model.B.reshape(5, 4, 5)
+    for i in range(5):
+        expected = np.zeros((5, 4))
+        expected[i, :2] = -math.sin(angle[i]), math.cos(angle[i])
+        np.testing.assert_allclose(push[:, :, i], expected, atol=1e-14)
 
 
 def strain_energy(grid: SegmentGrid, angle: Array, displacement: Array) -> float:
