@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -83,6 +84,26 @@ def test_observer(ranks: tuple[int, int]) -> None:
     nondimensional = gain(4, 2, ranks)
     si = observer_factors(nondimensional, ARM)
     compare(nondimensional, si, UNITS[[1, 3]], UNITS / TIME)
+
+
+def test_an_observer_that_sees_the_curvature_only_has_a_zero_column() -> None:
+    """Innovations of the velocity, which nobody measures, leave its estimate alone."""
+    strain_only = msgspec.structs.replace(ARM, measured=["k"])
+    nondimensional = gain(4, 1, (2, 3))
+    si = observer_factors(nondimensional, strain_only)
+    for part in (si.n0, si.n1b, si.n2b):
+        assert part.array.shape[1] == 2
+        assert not part.array[:, 0].any()
+    whole = GainFactors(
+        n0=np.concatenate([np.zeros_like(nondimensional.n0), nondimensional.n0], axis=1),
+        n1a=nondimensional.n1a,
+        n1b=np.concatenate([np.zeros_like(nondimensional.n1b), nondimensional.n1b], axis=1),
+        n2a=nondimensional.n2a,
+        n2b=np.concatenate([np.zeros_like(nondimensional.n2b), nondimensional.n2b], axis=1),
+    )
+    compare(whole, si, UNITS[[1, 3]], UNITS / TIME)
+    with pytest.raises(ValueError, match="1 inputs"):
+        observer_factors(nondimensional, ARM)
 
 
 @pytest.mark.parametrize("ranks", [(2, 3), (0, 2), (1, 0), (0, 0)])
