@@ -18,6 +18,7 @@ from wire.errors import ExitCode, UsageError
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 Ints = Annotated[tuple[int, ...], tyro.conf.UseAppendAction]
+Texts = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 Settings = Annotated[
     tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="NAME=VALUE")
 ]
@@ -316,12 +317,55 @@ def animate(
     return int(ExitCode.OK)
 
 
+def study(
+    name: tyro.conf.Positional[Literal["robustness", "baselines", "convergence"]],
+    *,
+    gains: Path = DEFAULT_GAINS,
+    setpoint: Texts = (),
+    nodes: Ints = (),
+    tick: float | None = None,
+    ticks: int | None = None,
+    out: Path | None = None,
+    force: Flag = False,
+    json: Flag = False,
+    quiet: Flag = False,
+) -> int:
+    """Study the closed loop on the exact arm: robustness, other controllers, refinement.
+
+    Args:
+        name: What to study.
+        gains: Gains artefact, made by `octarm design`.
+        setpoint: By its name; may be given several times; default: the study's own choice.
+        nodes: Number of segments; may be given several times where several are compared.
+        tick: Period of a tick in seconds.
+        ticks: Number of ticks of a simulation.
+        out: Directory for the facts (JSON) and the plot (PNG), made if missing.
+        force: Write over existing files.
+        json: Print one JSON object instead of the table.
+        quiet: No progress.
+    """
+    from supervise.studying import run_study
+
+    choices = {
+        "setpoint": setpoint,
+        "nodes": nodes,
+        "tick": None if tick is None else (tick,),
+        "ticks": None if ticks is None else (ticks,),
+    }
+    done = run_study(name, gains, choices, out, teller(silent=quiet or json), force=force)
+    show_json(done.facts) if json else print(
+        "\n".join([done.table.rstrip(), *map(str, done.files)])
+    )
+    return int(ExitCode.OK)
+
+
 VERBS: dict[str, Callable[..., int]] = {
     "run": run,
     "design": design,
     "solve": solve,
     "deploy": deploy,
     "animate": animate,
+    "study": study,
     "doctor": doctor,
 }
 
