@@ -263,10 +263,10 @@ def _check_setpoint(entry: SetpointEntry, where: str, arm: ArmFile) -> None:
 
 
 def _check_equilibrium(entry: SetpointEntry, where: str, arm: ArmFile) -> None:
-    """UsageError unless a transverse load can hold the setpoint (theory, section 5)."""
+    """UsageError unless a load along the actuators can hold the setpoint (theory, section 5)."""
     try:
         setpoint = entry.nondimensional(arm.geometry.length_m)
-        equilibrium_load(setpoint, axial_ratio(arm.arm()) ** 2)
+        equilibrium_load(setpoint, axial_ratio(arm.arm()) ** 2, arm.actuators.force)
     except ValueError as error:
         raise UsageError(f"{where}: {error}") from None
 

@@ -1,4 +1,4 @@
-"""Equilibrium shapes of the arm: curvature, frame vectors and the transverse load that holds each shape.
+"""Equilibrium shapes of the arm: curvature, frame vectors and the load that holds each shape.
 
 A setpoint is a polynomial curvature kappa_e(s) with kappa_e(1) = kappa_e'(1) = 0: no moment and no shear at
 the free tip (theory, section 2). Everything here is nondimensional, s in [0, 1].
@@ -17,6 +17,7 @@ from scipy.optimize import brentq
 
 from design import legendre
 from design.legendre import Array
+from wire.artefact import ACTUATORS
 
 FIT_SIZES = (32, 64, 128, 256)
 """Numbers of Legendre functions to try for the holding load, which is smooth but no polynomial."""
@@ -65,12 +66,30 @@ class Setpoint:
         return float(np.sqrt(sum(np.sum(t**2) for t in tails)))
 
 
-def equilibrium_load(setpoint: Setpoint, axial_stiffness: float) -> tuple[Array, Array]:
-    """Holding load f_e = -N_y' and axial strain e_e, coefficients in the orthonormal basis (theory, 5).
+def equilibrium_load(
+    setpoint: Setpoint, axial_stiffness: float, actuator: str = ACTUATORS[0]
+) -> tuple[Array, Array]:
+    """Holding load f_e and axial strain e_e, coefficients in the orthonormal basis (theory, 5; EI = L = 1).
 
-    The load is transverse only, so N = (0, N_y) with N_y = -theta''/((1 + e) cos theta) and
-    axial_stiffness e = N_y sin theta (EI = L = 1). Raises ValueError if the arm turns by 90 degrees or
-    more, so that it would have to point along the load, or is too soft along its axis.
+    The load per reference arclength is along y ("transverse") or along the normal of the deformed centre
+    line ("normal"), see `wire.artefact.Arm.actuator`. Raises ValueError if no such load holds the shape: a
+    transverse one if the arm turns by 90 degrees or more, so that it would have to point along the load,
+    either if the arm is too soft along its axis.
+    """
+    balance = _normal_balance if actuator == "normal" else _transverse_balance
+    for size in FIT_SIZES:
+        load, strain = balance(setpoint, axial_stiffness, size)
+        if np.max(np.abs(load[-2:])) <= RESOLVED * np.max(np.abs(load)):
+            break
+    return legendre.from_plain(load), strain
+
+
+def _transverse_balance(
+    setpoint: Setpoint, axial_stiffness: float, size: int
+) -> tuple[Array, Array]:
+    """Load (plain Legendre series) and strain in `size` basis functions, from the two static balances.
+
+    N = (0, N_y) with N_y = -theta''/((1 + e) cos theta), axial_stiffness e = N_y sin theta, f_e = -N_y'.
     """
     angle = setpoint.angle
     turn = float(np.max(np.abs(legendre.basis(np.linspace(0.0, 1.0, 257), angle.size) @ angle)))
@@ -79,20 +98,9 @@ def equilibrium_load(setpoint: Setpoint, axial_stiffness: float) -> tuple[Array,
             f"setpoint {setpoint.name}: the arm turns by {np.degrees(turn):.1f} degrees; "
             "a transverse load can hold less than 90"
         )
-    for size in FIT_SIZES:
-        force, strain = _balance(setpoint, axial_stiffness, size)
-        load = -2.0 * legder(legendre.to_plain(force))
-        if np.max(np.abs(load[-2:])) <= RESOLVED * np.max(np.abs(load)):
-            break
-    return legendre.from_plain(load), strain
-
-
-def _balance(setpoint: Setpoint, axial_stiffness: float, size: int) -> tuple[Array, Array]:
-    """N_y and the axial strain in `size` basis functions, from the two static balances."""
     nodes, _ = legendre.gauss(size)
-    theta = legendre.basis(nodes, setpoint.angle.size) @ setpoint.angle
-    kappa = legendre.to_plain(np.append(setpoint.curvature, 0.0))
-    rate = legval(2.0 * nodes - 1.0, 2.0 * legder(kappa))
+    theta = legendre.basis(nodes, angle.size) @ angle
+    rate = _derivative(legendre.to_plain(setpoint.curvature), nodes)
     # e (1 + e) = -theta'' tan(theta) / axial_stiffness, on the branch that starts at e = 0
     discriminant = 1.0 - 4.0 * rate * np.tan(theta) / axial_stiffness
     if np.any(discriminant <= 0.0):
@@ -101,7 +109,38 @@ def _balance(setpoint: Setpoint, axial_stiffness: float, size: int) -> tuple[Arr
             f"{axial_stiffness:g}, the arm would be compressed by half; use a stiffer arm or bend less"
         )
     strain = 0.5 * (np.sqrt(discriminant) - 1.0)
-    return legendre.fit(-rate / ((1.0 + strain) * np.cos(theta))), legendre.fit(strain)
+    force = legendre.fit(-rate / ((1.0 + strain) * np.cos(theta)))
+    return np.asarray(-2.0 * legder(legendre.to_plain(force))), legendre.fit(strain)
+
+
+def _normal_balance(setpoint: Setpoint, axial_stiffness: float, size: int) -> tuple[Array, Array]:
+    """Load (plain Legendre series) and strain in `size` basis functions, from the two static balances.
+
+    N = axial_stiffness e t + Q n with Q = -theta''/(1 + e). Nothing pulls along t: axial_stiffness e' =
+    theta' Q, and as e and theta' vanish at the tip, (1 + e)^2 = 1 - theta'^2 / axial_stiffness: every
+    bend compresses, at whatever angle. f_e = -Q' - theta' axial_stiffness e.
+    """
+    nodes, _ = legendre.gauss(size)
+    series = legendre.to_plain(setpoint.curvature)
+    bend, rate = legval(2.0 * nodes - 1.0, series), _derivative(series, nodes)
+    square = 1.0 - bend**2 / axial_stiffness
+    if np.any(square <= 0.25):
+        raise ValueError(
+            f"setpoint {setpoint.name}: no normal load holds this shape with axial stiffness "
+            f"{axial_stiffness:g}, the arm would be compressed by half; use a stiffer arm or bend less"
+        )
+    stretch = np.sqrt(square)
+    # e without the difference of two numbers near 1
+    strain = -(bend**2) / axial_stiffness / (stretch + 1.0)
+    second = _derivative(2.0 * legder(np.append(series, 0.0)), nodes)
+    stretch_rate = -bend * rate / (axial_stiffness * stretch)
+    load = second / stretch - rate * stretch_rate / square - bend * axial_stiffness * strain
+    return legendre.to_plain(legendre.fit(load)), legendre.fit(strain)
+
+
+def _derivative(series: Array, s: Array) -> Array:
+    """Values of the derivative of a plain Legendre series in 2 s - 1."""
+    return np.asarray(legval(2.0 * s - 1.0, 2.0 * legder(np.append(series, 0.0))))
 
 
 def tip_position(setpoint: Setpoint, strain: Array) -> Array:

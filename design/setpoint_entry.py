@@ -22,7 +22,7 @@ def setpoint_entry(arm: Arm, setpoint: Setpoint) -> SetpointGains:
     Raises UsageError if no load can hold the shape (theory, section 5).
     """
     try:
-        load, strain = equilibrium_load(setpoint, axial_ratio(arm) ** 2)
+        load, strain = equilibrium_load(setpoint, axial_ratio(arm) ** 2, arm.actuator)
     except ValueError as error:
         raise UsageError(f"arm file: {error}") from None
     curvature = legendre.to_plain(setpoint.curvature) / arm.length_m

@@ -170,11 +170,11 @@ def test_frame_degree_is_the_smallest_within_the_tolerance() -> None:
 
 
 def exact_beam(
-    load: Legendre, guess: Setpoint, axial_stiffness: float
+    load: Legendre, guess: Setpoint, axial_stiffness: float, follows: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Static beam, chapter (1), under a transverse load: (s, curvature, positions (2, m)).
+    """Static beam, chapter (1), under a load along y, or along n: (s, curvature, positions (2, m)).
 
-    States (x, y, theta, kappa, N_x, N_y) with r' = (1 + e) t, theta' = kappa, N' = -(0, load),
+    States (x, y, theta, kappa, N_x, N_y) with r' = (1 + e) t, theta' = kappa, N' = -load (y or n),
     kappa' = -(1 + e) n.N, e = t.N / axial_stiffness; clamped at 0, N = 0 and kappa = 0 at 1.
     """
 
@@ -183,8 +183,8 @@ def exact_beam(
         cosine, sine = np.cos(theta), np.sin(theta)
         stretch = 1.0 + (cosine * n_x + sine * n_y) / axial_stiffness
         bend = -stretch * (cosine * n_y - sine * n_x)
-        zero = np.zeros_like(s)
-        return np.stack([stretch * cosine, stretch * sine, kappa, bend, zero, -load(s)])
+        push = -load(s) * (np.stack([-sine, cosine]) if follows else np.array([[0.0], [1.0]]))
+        return np.stack([stretch * cosine, stretch * sine, kappa, bend, *push])
 
     def ends(root: Array, tip: Array) -> Array:
         return np.array([root[0], root[1], root[2], tip[3], tip[4], tip[5]])
@@ -192,7 +192,9 @@ def exact_beam(
     s = np.linspace(0.0, 1.0, 81)
     start = np.zeros((6, s.size))
     angle = series(guess.curvature).integ(lbnd=0.0)
-    start[2], start[3], start[5] = angle(s), series(guess.curvature)(s), -load.integ(lbnd=1.0)(s)
+    start[2], start[3] = angle(s), series(guess.curvature)(s)
+    if not follows:
+        start[5] = -load.integ(lbnd=1.0)(s)
     start[0] = s
     found = solve_bvp(rates, ends, s, start, tol=1e-8, max_nodes=20000)
     assert found.success, found.message
@@ -214,6 +216,53 @@ def test_the_exact_beam_takes_the_shape_under_the_holding_load(
     expected = series(setpoint.curvature)(s)
     np.testing.assert_allclose(curvature, expected, atol=1e-6 * np.max(np.abs(expected)))
     np.testing.assert_allclose(position[:, -1], tip_position(setpoint, strain), atol=1e-7)
+
+
+@pytest.mark.parametrize(("turn", "axial_stiffness"), [(50.0, AXIAL_STIFFNESS), (130.0, 300.0)])
+def test_the_exact_beam_takes_the_shape_under_a_load_along_its_normal(
+    turn: float, axial_stiffness: float
+) -> None:
+    """Also beyond 90 degrees, where no transverse load could."""
+    c = np.radians(turn)
+    setpoint = from_powers("hook", *(Polynomial([1, -2, 1]) * Polynomial([1.5 * c, 6.0 * c])).coef)
+    load, strain = equilibrium_load(setpoint, axial_stiffness, "normal")
+    s, curvature, position = exact_beam(series(load), setpoint, axial_stiffness, follows=True)
+    expected = series(setpoint.curvature)(s)
+    np.testing.assert_allclose(curvature, expected, atol=1e-6 * np.max(np.abs(expected)))
+    np.testing.assert_allclose(position[:, -1], tip_position(setpoint, strain), atol=1e-6)
+
+
+def test_nothing_pulls_along_an_arm_under_normal_loads() -> None:
+    """Balance of forces on the piece beyond s, by quadrature: N(s) = int_s^1 f n, EA e = t.N."""
+    setpoint = chapter("3")
+    load, strain = equilibrium_load(setpoint, AXIAL_STIFFNESS, "normal")
+    angle = series(setpoint.angle)
+    for s in (0.0, 0.05, 0.4, 0.9):
+        here = angle(s)
+        axial, shear = (
+            quad(lambda z, f=f, a=here: series(load)(z) * f(angle(z) - a), s, 1.0, epsabs=1e-12)[0]
+            for f in (lambda x: -np.sin(x), np.cos)
+        )
+        e = series(strain)(s)
+        assert AXIAL_STIFFNESS * e == pytest.approx(axial, abs=1e-10 * AXIAL_STIFFNESS)
+        bend = series(setpoint.curvature).deriv()(s)
+        assert shear == pytest.approx(-bend / (1.0 + e), abs=1e-8 * np.max(np.abs(load)))
+
+
+def test_the_two_actuators_agree_on_a_nearly_straight_arm() -> None:
+    size = 1e-5
+    setpoint = from_powers("small", size, -2 * size, size)
+    transverse, _ = equilibrium_load(setpoint, AXIAL_STIFFNESS)
+    normal, _ = equilibrium_load(setpoint, AXIAL_STIFFNESS, "normal")
+    s = np.linspace(0.0, 1.0, 7)
+    np.testing.assert_allclose(series(normal)(s), series(transverse)(s), rtol=1e-8)
+
+
+def test_bends_that_would_crush_a_soft_arm_are_refused_for_normal_loads_too() -> None:
+    setpoint = from_powers("tight", 9.0, -18.0, 9.0)
+    equilibrium_load(setpoint, 1.1 * 9.0**2 / 0.75, "normal")
+    with pytest.raises(ValueError, match="setpoint tight: no normal load holds this shape"):
+        equilibrium_load(setpoint, 0.9 * 9.0**2 / 0.75, "normal")
 
 
 def test_strain_carries_the_axial_part_of_the_force() -> None:
