@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scipy.integrate import quad
+from scipy.integrate import cumulative_trapezoid, quad, trapezoid
 from scipy.optimize import brentq
 
 from design.arm_file import (
@@ -61,7 +61,18 @@ def test_example_is_the_chapters_arm() -> None:
     assert axial_ratio(arm) == pytest.approx(80.0, rel=1e-12)
     assert arm.drag_per_s * time_unit_s(arm) == pytest.approx(0.7032, abs=1e-4)
     assert file.weights.measurement_noise == file.weights.control_effort == 0.1
-    assert [s.name for s in file.setpoints] == ["straight", "1"]
+    assert [s.name for s in file.setpoints] == ["1", "2", "3"]
+    for entry, x_tip, degrees in zip(
+        file.setpoints, (0.9645, 0.6896, 0.2568), (14.45, 45.08, 74.94), strict=True
+    ):  # theory, section 1; setpoint 3 as no arm can bend to it
+        s = np.linspace(0.0, 1.0, 2001)
+        angle = cumulative_trapezoid(curvature_samples(entry, 1.0, s.size), s, initial=0)
+        tip = trapezoid(np.cos(angle), s), trapezoid(np.sin(angle), s)
+        assert tip[0] == pytest.approx(x_tip, abs=0.015 if entry.name == "3" else 1e-3)
+        assert math.degrees(math.atan2(tip[1], tip[0])) == pytest.approx(
+            degrees, abs=1.1 if entry.name == "3" else 0.1
+        )
+    assert max(curvature_samples(file.setpoints[2], 1.0)) == pytest.approx(15.7, abs=0.1)
 
 
 def test_damping_ratio_is_that_of_the_first_bending_mode() -> None:
