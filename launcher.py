@@ -13,7 +13,7 @@ from typing import Annotated, Literal, NoReturn
 import tyro
 
 from supervise.entry import serve, show_json, teller
-from supervise.shipped import DEFAULT_ARM, DEFAULT_GAINS, SUITE
+from supervise.shipped import DEFAULT_ARM, DEFAULT_GAINS
 from wire.errors import ExitCode, UsageError
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
@@ -199,33 +199,15 @@ def solve(
         json: Print one JSON object instead of the table.
         quiet: No progress.
     """
-    from analysis.solve_table import answer_table, suite_table
-    from design.solve_command import Choices, finite, prepare
-    from design.solve_suite import read_suite
-    from supervise.solving import solve_in_child
-    from supervise.suite import run_suite
+    from design.solve_command import Choices
+    from supervise.asking import ask_file, ask_suite
 
-    tell = teller(silent=quiet or json)
     choices = Choices(task, bisect, settings, degree, time_limit, solver, dump_problem)
-    if suite:
-        if file is not None or choices != Choices(time_limit_s=time_limit, solver=solver):
-            raise UsageError(
-                "--suite: takes --only, --time-limit and --solver, no file or other choice"
-            )
-        table = run_suite(read_suite(SUITE, only), SUITE.parent, choices, solve_in_child, tell)
-        show_json(finite(table)) if json else print(suite_table(table), end="")
-        refused, interrupted = not table["ok"], table["interrupted"]
-    else:
-        if file is None or only:
-            raise UsageError(
-                "--only: is for --suite" if only else "FILE: expected a problem file, or --suite"
-            )
-        answer = solve_in_child(prepare(file, choices), tell)
-        show_json(finite(answer.facts)) if json else print(answer_table(answer.facts), end="")
-        refused, interrupted = answer.facts["status"] != "certified", answer.interrupted
-    if interrupted:
+    found = (ask_suite if suite else ask_file)(file, only, choices, teller(silent=quiet or json))
+    show_json(found.facts) if json else print(found.table, end="")
+    if found.interrupted:
         raise KeyboardInterrupt
-    return int(ExitCode.GAINS_REFUSED if refused else ExitCode.OK)
+    return int(ExitCode.OK if found.well else ExitCode.GAINS_REFUSED)
 
 
 def deploy(
