@@ -13,6 +13,7 @@ from typing import Annotated, Literal, NoReturn
 import tyro
 
 from supervise.entry import serve, show_json, teller
+from supervise.options import RunOptions
 from supervise.shipped import DEFAULT_ARM, DEFAULT_GAINS
 from wire.errors import ExitCode, UsageError
 
@@ -27,47 +28,51 @@ Span = Annotated[tuple[str, float, float] | None, tyro.conf.arg(metavar="NAME LO
 
 def run(
     *,
-    gains: Path = DEFAULT_GAINS,
-    nodes: int = 10,
-    ticks: int = 1200,
-    tick: float = 0.1,
-    seed: int = 1,
-    setpoint: str = "1",
-    initial: str = "chapter",
-    disturbance: str = "chapter",
-    disturbance_amplitude: float = 1.0,
-    noise_velocity: float = 1e-4,
-    noise_curvature: float = 1e-3,
-    plant_cells: int | None = None,
-    spacing: str = "equispaced",
+    gains: Path = RunOptions.gains,
+    scenario: str = RunOptions.scenario,
+    nodes: int = RunOptions.nodes,
+    ticks: int | None = RunOptions.ticks,
+    tick: float = RunOptions.tick_s,
+    seed: int = RunOptions.seed,
+    setpoint: str | None = RunOptions.setpoint,
+    initial: str | None = RunOptions.initial,
+    disturbance: str | None = RunOptions.disturbance,
+    disturbance_amplitude: float | None = RunOptions.disturbance_amplitude,
+    noise_velocity: float | None = RunOptions.noise_velocity,
+    noise_curvature: float | None = RunOptions.noise_curvature,
+    plant_cells: int | None = RunOptions.plant_cells,
+    spacing: str = RunOptions.spacing,
     out: Path | None = None,
     json: Flag = False,
     no_plot: Flag = False,
     quiet: Flag = False,
     transport: Literal["unix", "tcp"] = "unix",
-    base_port: int | None = None,
-    socket_dir: Path | None = None,
-    start_timeout: float = 20.0,
-    deadline: float = 10.0,
-    by_hand: Ints = (),
+    base_port: int | None = RunOptions.base_port,
+    socket_dir: Path | None = RunOptions.socket_dir,
+    start_timeout: float = RunOptions.start_timeout_s,
+    deadline: float = RunOptions.deadline_s,
+    by_hand: Ints = RunOptions.by_hand,
     no_pin: Flag = False,
 ) -> int:
     """Run the arm: one process a segment, a plant and a recorder; leaves a recording and a plot.
 
     Args:
         gains: Gains artefact, made by `octarm design`.
+        scenario: What happens: hold, reach, track or chapter, or a scenario file (TOML). Options given here
+            win over what it says.
         nodes: Number of segments, each a process of its own; at least 2.
-        ticks: Number of ticks.
+        ticks: Number of ticks; default: the scenario's duration.
         tick: Period of a tick in seconds of simulated time.
         seed: Of the sensors' noise; two runs with one seed give the same numbers.
-        setpoint: Name of the equilibrium shape in the gains artefact.
+        setpoint: Name of the equilibrium shape, in the gains artefact, that the arm starts at; default: the
+            scenario's, as of all that follow.
         initial: Shape at the start, at rest: setpoint, straight, or chapter (the chapter's
             deviation added to the setpoint).
         disturbance: Load that nobody commanded: none, chapter, sine, gust or step.
         disturbance_amplitude: In N/m; for chapter a factor without unit.
         noise_velocity: Standard deviation of the velocity sensors in m/s.
         noise_curvature: Standard deviation of the curvature sensors in 1/m.
-        plant_cells: Cells of the emulated arm's own grid; default max(40, 4 nodes).
+        plant_cells: Cells of the emulated arm's own grid; default max(40, 4 nodes) or the scenario's.
         spacing: Where the segments end: equispaced, chebyshev, or nodes + 1 boundaries in m from root to
             tip, separated by commas or in a file.
         out: Directory for recording, plot and log, made if missing; default runs/<run id>.
@@ -83,10 +88,10 @@ def run(
         no_pin: Leave the nodes' cores to the scheduler.
     """
     from supervise.execute import execute
-    from supervise.plan import RunOptions
 
     options = RunOptions(
         gains=gains,
+        scenario=scenario,
         nodes=nodes,
         ticks=ticks,
         tick_s=tick,

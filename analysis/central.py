@@ -2,14 +2,16 @@
 
 From the recorded measurements and the deployment alone, tick by tick,
 
-    (xh(k+1), u(k+1)) = M ((xh(k), u(k), y(k)) - in_offset) + out_offset      chapter (5), theory 5
+    (xh(k+1), u(k+1)) = M ((xh(k), u(k), y(k)) - in_ref(k)) + out_ref(k+1)      chapter (5), theory 5
 
-with one dense matrix M of shape (5n, 7n), and compared with what the nodes recorded while each of
-them held its own few numbers only.
+with one dense matrix M of shape (5n, 7n) for each setpoint, and compared with what the nodes recorded
+while each of them held its own few numbers only. Which setpoint's matrix is used is decided here again,
+from the estimate of the whole arm.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +19,8 @@ import numpy.typing as npt
 
 from analysis.metrics import energy_norm
 from analysis.recording import QUANTITIES, Recording
-from deploy import DenseStep
+from analysis.shape_error import face_positions
+from node.scheduling import ArmEnd, Sectors
 from wire.errors import UsageError
 
 Array = npt.NDArray[np.float64]
@@ -57,23 +60,53 @@ class CentralComparison:
     """Ticks compared: up to the first one with a missing measurement."""
     missing: int
     """Estimates and commands in these ticks that the recorder did not get."""
+    changes: tuple[int, ...]
+    """Ticks from which on another setpoint's gains are used, in the central run."""
 
 
-def central_run(
-    step: DenseStep, initial_estimates: Array, initial_commands: Array, measurements: Array
-) -> tuple[Array, Array]:
-    """Run the dense step over the measurements.
+@dataclass(frozen=True, eq=False)
+class CentralRun:
+    """What one computer with all the numbers would have done; K ticks, SI units."""
 
-    initial_estimates: (n, 4); initial_commands: (n,); measurements: (K, n, 2). Returns the
-    estimates xh(k), (K, n, 4), and commands u(k), (K, n), for k = 0 .. K - 1; SI units.
-    """
-    ticks, nodes, _ = measurements.shape
-    state = np.concatenate([initial_estimates, initial_commands[:, None]], axis=1)
-    out = np.empty((ticks, nodes, 5))
+    estimates: Array
+    """xh(k), (K, n, 4)."""
+    commands: Array
+    """u(k), (K, n)."""
+    setpoints: npt.NDArray[np.int64]
+    """(K,) index of the setpoint whose matrix is used in tick k."""
+    bumps: Array
+    """(K, n): the part of u(k) that hides a change of gains."""
+
+
+def central_run(recording: Recording, ticks: int) -> CentralRun:
+    """Run the dense steps over the recorded measurements for so many ticks."""
+    run, faces = recording.configuration, np.asarray(recording.configuration.faces_m)
+    steps, references = recording.deployment.dense, recording.references
+    sectors = Sectors.of(run.scheduling)
+    fade = math.exp(-run.tick_s / run.scheduling.bump_s)
+    state = np.concatenate(
+        [recording.initial_estimates, recording.initial_commands[:, None]], axis=1
+    )
+    out, bumps = np.empty((ticks, run.nodes, 5)), np.zeros((ticks, run.nodes))
+    setpoints = np.empty(ticks, dtype=np.int64)
+    active = announced = run.setpoint_index
+    changed, bump, now = False, np.zeros(run.nodes), references.states(0)
     for k in range(ticks):
-        out[k] = state
-        state = step(np.concatenate([state, measurements[k]], axis=1))
-    return out[:, :, :4], out[:, :, 4]
+        out[k], bumps[k], setpoints[k] = state, bump, active
+        then = references.states(k + 1)
+        inputs = np.concatenate([state, recording.measurements[k]], axis=1)
+        following = steps[active].about(inputs, now, then)
+        if changed:
+            bump = (state[:, 4] - now[:, 4]) - (following[:, 4] - then[:, 4])
+        else:
+            bump = bump * fade
+        following[:, 4] += bump
+        # What the tip node announces in this tick, it has decided by the estimate of the tick before.
+        tip = face_positions(state[:, :4], faces)[-1]
+        changed, active = announced != active, announced
+        announced = sectors.choose(announced, ArmEnd(0.0, *tip.tolist()))
+        state, now = following, then
+    return CentralRun(out[:, :, :4], out[:, :, 4], setpoints, bumps)
 
 
 def compare_with_central(recording: Recording, tolerance: float = 1e-12) -> CentralComparison:
@@ -85,20 +118,14 @@ def compare_with_central(recording: Recording, tolerance: float = 1e-12) -> Cent
 
     Raises UsageError if the recording has no complete tick.
     """
-    deployment = recording.deployment
     usable = np.isfinite(recording.measurements).all(axis=(1, 2))
     ticks = int(np.argmin(usable)) if not usable.all() else usable.size
     # The values of tick k depend on measurements up to k - 1 only.
     ticks = min(ticks + 1, recording.ticks)
     if ticks == 0:
         raise UsageError(f"recording {recording.path}: no complete tick in it; nothing to compare")
-    estimates, commands = central_run(
-        deployment.dense[recording.configuration.setpoint_index],
-        recording.initial_estimates,
-        recording.initial_commands,
-        recording.measurements[:ticks],
-    )
-    central = np.concatenate([estimates, commands[:, :, None]], axis=2)
+    run = central_run(recording, ticks)
+    central = np.concatenate([run.estimates, run.commands[:, :, None]], axis=2)
     recorded = np.concatenate(
         [recording.estimates[:ticks], recording.commands[:ticks, :, None]], axis=2
     )
@@ -129,6 +156,7 @@ def compare_with_central(recording: Recording, tolerance: float = 1e-12) -> Cent
         scales=dict(zip(QUANTITIES, scales.tolist(), strict=True)),
         ticks=ticks,
         missing=int(np.count_nonzero(missing)),
+        changes=tuple((1 + np.flatnonzero(np.diff(run.setpoints))).tolist()),
     )
 
 

@@ -18,7 +18,8 @@ import numpy.typing as npt
 
 from analysis.mcap_file import McapContent, read_mcap
 from analysis.table import Table, decode_table
-from deploy import Deployment, deploy
+from deploy import Deployment, SegmentGrid, deploy
+from deploy.path import References, make_references
 from wire.artefact import FORMAT as GAINS_FORMAT
 from wire.artefact import GainsArtefact, parse_artefact
 from wire.channels import (
@@ -114,8 +115,18 @@ class Recording:
 
     @cached_property
     def tip_error_m(self) -> Array:
-        """Distance of the tip from the setpoint's, (K,)."""
+        """Distance of the tip from the reference's, (K,)."""
         return self.of_plant("tip", ("error_m",))[:, 0]
+
+    @cached_property
+    def tips_m(self) -> Array:
+        """Where the tip is, (K, 2)."""
+        return self.of_plant("tip", ("x_m", "y_m"))
+
+    @cached_property
+    def bumps(self) -> Array:
+        """Part of the commands that hides a change of gains and is faded out, N/m, (K, n)."""
+        return self.of_nodes("schedule", ("bump_n_per_m",))[:, :, 0]
 
     @cached_property
     def shapes_m(self) -> Array:
@@ -147,7 +158,24 @@ class Recording:
     def deployment(self) -> Deployment:
         """The sweep factors and dense steps, computed anew from artefact and configuration."""
         run = self.configuration
-        return deploy(self.artefact, run.nodes, run.tick_s, run.faces_m)
+        deployment = deploy(self.artefact, run.nodes, run.tick_s, run.faces_m)
+        return deployment if run.control else deployment.without_control()
+
+    @cached_property
+    def references(self) -> References:
+        """What nodes and plant should have done at each tick, computed anew like `deployment`."""
+        run = self.configuration
+        grid = SegmentGrid(np.asarray(run.faces_m))
+        return make_references(
+            self.artefact, grid, run.tick_s, run.setpoint, run.first_hold_s, run.legs
+        )
+
+    @cached_property
+    def setpoints_used(self) -> npt.NDArray[np.int64]:
+        """(K,) index of the setpoint whose gains the root node uses; -1 where that was not recorded."""
+        table = self.table(f"/node/{self._label(0)}/schedule")
+        used = table.by_tick(("setpoint",), self.ticks)[:, 0]
+        return np.where(np.isfinite(used), used, -1.0).astype(np.int64)
 
     def counter(self, name: str) -> int | None:
         """A total of the final counters (docs/recording.md); None if the recorder wrote none."""

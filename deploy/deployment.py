@@ -9,21 +9,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NoReturn
 
 import numpy as np
 import numpy.typing as npt
-from numpy.polynomial import legendre
 
 from deploy.arm import ArmModes, make_arm_modes
-from deploy.feedforward import holding_commands
-from deploy.grid import Place, SegmentGrid, make_grid
+from deploy.equilibrium import equilibrium
+from deploy.grid import MEASURED_STATES, Place, SegmentGrid, make_grid
+from deploy.held import Holder
 from deploy.semiseparable import NodeMatrices, multiply, realise
 from deploy.stability import SpectralRadius, longest_stable_tick, spectral_radius
 from deploy.step import Loop, Step, gain_rate, make_loop, make_step
-from wire.artefact import GainsArtefact, Setpoint
+from wire.artefact import Arm, GainsArtefact, Setpoint
 from wire.errors import OctarmError, UsageError
 from wire.factors import INPUTS, OUTPUTS, STATES, NodeFactors, SweepFactors
 
@@ -46,9 +46,14 @@ class DenseStep:
     out_offset: Array
 
     def __call__(self, inputs: Array) -> Array:
-        """One tick: absolute inputs (n, 7) to absolute outputs (n, 5)."""
+        """One tick at the setpoint: absolute inputs (n, 7) to absolute outputs (n, 5)."""
         out = self.M @ (inputs.ravel() - self.in_offset) + self.out_offset
         return np.asarray(out.reshape(-1, OUTPUTS), dtype=np.float64)
+
+    def about(self, inputs: Array, now: Array, then: Array) -> Array:
+        """One tick around a reference that moves: `now` and `then`, each (n, 5), at this tick and the next."""
+        deviation = inputs - np.concatenate([now, now[:, MEASURED_STATES]], axis=1)
+        return np.asarray((self.M @ deviation.ravel()).reshape(-1, OUTPUTS) + then)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +68,10 @@ class Deployment:
     dense: tuple[DenseStep, ...]
     """Per setpoint, the centralised reference."""
     ranks_forward: tuple[tuple[int, ...], ...]
-    """Per setpoint, numbers in the forward message at each of the n - 1 cuts, root to tip."""
+    """Per setpoint, numbers in the forward sum at each of the n - 1 cuts, root to tip. Sums shorter than
+    another setpoint's are padded with zeros in the factors, so that messages have one length."""
     ranks_backward: tuple[tuple[int, ...], ...]
-    """Per setpoint, numbers in the backward message at each of the n - 1 cuts, root to tip."""
+    """Per setpoint, numbers in the backward sum at each of the n - 1 cuts, root to tip."""
     check: float
     """Largest relative difference of sweeps and dense matrix, random inputs, over all setpoints."""
     spectral_radius: tuple[SpectralRadius, ...]
@@ -81,6 +87,23 @@ class Deployment:
         Computed when asked for (some seconds at 100 nodes).
         """
         return longest_stable_tick(self._loops, self.tick_s, stable=True)
+
+    def without_control(self) -> Deployment:
+        """The same without feedback: the commands are the reference's own, whatever the estimate is."""
+        open_nodes = []
+        for node in self.nodes:
+            factors = []
+            for one in node.setpoints:
+                D, P, U = one.D.copy(), one.P.copy(), one.U.copy()
+                D[STATES], P[STATES], U[STATES] = 0.0, 0.0, 0.0
+                factors.append(replace(one, D=D, P=P, U=U))
+            open_nodes.append(replace(node, setpoints=tuple(factors)))
+        open_dense = []
+        for step in self.dense:
+            M = step.M.copy()
+            M[STATES::OUTPUTS] = 0.0
+            open_dense.append(replace(step, M=M))
+        return replace(self, nodes=tuple(open_nodes), dense=tuple(open_dense))
 
     @property
     def messages_per_tick(self) -> int:
@@ -128,7 +151,7 @@ def deploy(
         scaled = step.whole()
         realisation = realise(scaled, OUTPUTS, INPUTS)
         worst = max(worst, _difference(realisation, scaled))
-        in_offset, out_offset = _offsets(setpoint, grid)
+        in_offset, out_offset = _offsets(artefact.arm, setpoint, grid)
         matrix = scaled * step.scale_in / step.scale_out[:, None]
         dense.append(DenseStep(matrix, in_offset.ravel(), out_offset.ravel()))
         factors.append(_in_si(realisation, step, in_offset, out_offset))
@@ -142,7 +165,7 @@ def deploy(
         faces_m=grid.faces_m,
         tick_s=float(tick_s),
         setpoint_names=tuple(setpoint.name for setpoint in artefact.setpoints),
-        nodes=tuple(_node(i, [f[i] for f in factors]) for i in range(grid.nodes)),
+        nodes=tuple(_node(i, [f[i] for f in factors], grid) for i in range(grid.nodes)),
         dense=tuple(dense),
         ranks_forward=tuple(tuple(f.forward_sent for f in one[:-1]) for one in factors),
         ranks_backward=tuple(tuple(f.backward_sent for f in one[1:]) for one in factors),
@@ -187,17 +210,15 @@ def _difference(realisation: Sequence[NodeMatrices], scaled: Array) -> float:
     return worst
 
 
-def _offsets(setpoint: Setpoint, grid: SegmentGrid) -> tuple[Array, Array]:
-    """The setpoint on the grid, as inputs (n, 7) and outputs (n, 5): x_e, feed-forward, y_e."""
+def _offsets(arm: Arm, setpoint: Setpoint, grid: SegmentGrid) -> tuple[Array, Array]:
+    """The setpoint as n commands hold it, as inputs (n, 7) and outputs (n, 5): x_e, feed-forward, y_e."""
+    series = np.asarray(setpoint.curvature_per_m, dtype=np.float64)
+    held = Holder(arm, grid).hold(series, equilibrium(arm, series, f"setpoint {setpoint.name!r}"))
     in_offset = np.zeros((grid.nodes, INPUTS))
-    for column, place, series in (
-        (2, Place.CENTRE, setpoint.strain),
-        (3, Place.INNER_FACE, setpoint.curvature_per_m),
-        (6, Place.INNER_FACE, setpoint.curvature_per_m),
-    ):
-        scaled = 2.0 * grid.locations_m(place) / grid.length_m - 1.0
-        in_offset[:, column] = legendre.legval(scaled, np.asarray(series, dtype=np.float64))
-    in_offset[:, 4] = holding_commands(setpoint.feedforward_n_per_m, grid)
+    in_offset[:, 2] = held.strain
+    in_offset[:, 3] = held.curvature_per_m
+    in_offset[:, 4] = held.command_n_per_m
+    in_offset[:, OUTPUTS:] = in_offset[:, MEASURED_STATES]
     return in_offset, in_offset[:, :OUTPUTS].copy()
 
 
@@ -223,11 +244,40 @@ def _in_si(
     ]
 
 
-def _node(index: int, factors: Sequence[SweepFactors]) -> NodeFactors:
+def _node(index: int, factors: Sequence[SweepFactors], grid: SegmentGrid) -> NodeFactors:
     start = np.stack([one.out_offset for one in factors])
+    lengths = [grid.cell_widths_m[index], grid.dual_widths_m(Place.INNER_FACE)[index]]
     return NodeFactors(
         index=index,
+        nodes=grid.nodes,
+        lengths_m=np.array(lengths),
         initial_estimate=start[:, :STATES].copy(),
         initial_command=start[:, STATES].copy(),
-        setpoints=tuple(factors),
+        setpoints=tuple(_padded(factors)),
     )
+
+
+def _padded(factors: Sequence[SweepFactors]) -> list[SweepFactors]:
+    """The same maps with sums of one length: zeros where a setpoint's sums are shorter than another's."""
+    c, c_next, d, d_previous = (
+        max(getattr(one, name) for one in factors)
+        for name in ("forward_received", "forward_sent", "backward_received", "backward_sent")
+    )
+
+    def wide(matrix: Array, rows: int, columns: int) -> Array:
+        out = np.zeros((rows, columns))
+        out[: matrix.shape[0], : matrix.shape[1]] = matrix
+        return out
+
+    return [
+        replace(
+            one,
+            P=wide(one.P, OUTPUTS, c),
+            Q=wide(one.Q, c_next, INPUTS),
+            W=wide(one.W, c_next, c),
+            U=wide(one.U, OUTPUTS, d),
+            R=wide(one.R, d_previous, INPUTS),
+            V=wide(one.V, d_previous, d),
+        )
+        for one in factors
+    ]

@@ -9,6 +9,7 @@ tick has left.
 from __future__ import annotations
 
 import gc
+import math
 import os
 import traceback
 from collections.abc import Callable
@@ -18,9 +19,11 @@ from typing import Any
 
 import numpy as np
 
+from node.scheduling import Sectors
 from node.segment import NotFiniteError, Segment
 from node.sweep import NodeSweep
 from wire import session as zsession
+from wire.channels import COMMAND, MEASUREMENT, SCHEDULE, STATE
 from wire.child import Child, Deadline
 from wire.counters import Flow, Rejections
 from wire.errors import ExitCode
@@ -39,6 +42,7 @@ from wire.messages import (
     encode_numbers,
     run_tag,
 )
+from wire.reference import Reference
 from wire.run_config import NodeConfig
 
 BATCH_NS = 250_000_000
@@ -46,6 +50,8 @@ BATCH_NS = 250_000_000
 PLANT_PATIENCE = 3.0
 """Between two ticks a node waits this many deadlines: the plant, which has its own, should speak
 first."""
+OWN = len(MEASUREMENT) + len(STATE) + len(COMMAND) + len(SCHEDULE)
+"""Numbers of a telemetry row before the sums."""
 FAREWELL_S = 5.0
 """A node started by hand stays this long after the end, so that its last batch gets through."""
 
@@ -59,7 +65,14 @@ class NodeProcess:
         self._supervised = supervised
         self._keys = Keys(run_tag(config.run_id))
         factors = NodeFactors.from_plain(config.factors)
-        sweep = NodeSweep(factors, config.setpoint)
+        reference = Reference.from_plain(config.reference)
+        sweep = NodeSweep(
+            factors,
+            config.setpoint,
+            reference=reference,
+            sectors=Sectors.of(config.scheduling),
+            fade=math.exp(-reference.tick_s / config.scheduling.bump_s),
+        )
         self._lock = Lock()
         self._stop: Stop | None = None
         self._failure: tuple[str, str] | None = None
@@ -70,8 +83,8 @@ class NodeProcess:
         self._rejections = Rejections()
         self._lengths = {
             "measurement": [2] * len(factors.setpoints),
-            "forward": [f.forward_received for f in factors.setpoints],
-            "backward": [f.backward_received for f in factors.setpoints],
+            "forward": [factors.forward_received] * len(factors.setpoints),
+            "backward": [factors.backward_received] * len(factors.setpoints),
         }
         self._publishers: dict[str, Any] = {}
         self._subscribers: list[Any] = []
@@ -85,7 +98,7 @@ class NodeProcess:
         )
         sums = sweep.forward_received + sweep.backward_received
         instants = 2 + (config.index > 0) + (config.index < config.nodes - 1)
-        self._rows = np.empty((config.batch_ticks, 7 + sums + instants))
+        self._rows = np.empty((config.batch_ticks, OWN + sums + instants))
         self._instants = instants
         self._filled = 0
         self._batch_began_ns = 0
@@ -268,11 +281,11 @@ class NodeProcess:
             return
         self._child.wake()
 
-    def _sender(self, name: str, kind: Kind) -> Callable[[int, list[float]], None]:
+    def _sender(self, name: str, kind: Kind) -> Callable[[int, int, list[float]], None]:
         flow, publishers = self._sent[name], self._publishers
-        run, index, setpoint = self._keys.run, self._config.index, self._config.setpoint
+        run, index = self._keys.run, self._config.index
 
-        def send(tick: int, values: list[float]) -> None:
+        def send(tick: int, setpoint: int, values: list[float]) -> None:
             raw = encode_numbers(kind, run, tick, index, setpoint, values)
             publishers[name].put(raw)
             flow.add(raw)

@@ -15,8 +15,8 @@ from time import monotonic_ns
 from node.sweep import Array, NodeSweep
 from wire.messages import Numbers, Reason, RejectedError
 
-Send = Callable[[int, list[float]], None]
-"""Called with the tick and the numbers to send."""
+Send = Callable[[int, int, list[float]], None]
+"""Called with the tick, the setpoint that the numbers belong to, and the numbers to send."""
 
 
 class NotFiniteError(Exception):
@@ -26,7 +26,7 @@ class NotFiniteError(Exception):
 class Segment:
     """The state of one node within its tick. Not thread-safe: the process around it holds a lock.
 
-    `record` gets one row a tick: y (2), xh (4), u, c, d, then the instants on the monotonic clock,
+    `record` gets one row a tick: y (2), xh (4), u, setpoint, bump, c, d, then the instants on the monotonic clock,
     in ns, at which the measurement, c (unless first), d (unless last) came and the command left.
     """
 
@@ -49,6 +49,7 @@ class Segment:
         self._index = sweep.index
         self._first = sweep.index == 0
         self._last = sweep.index == nodes - 1
+        self._setpoints = frozenset(map(float, range(sweep.setpoints)))
         self._send_forward = send_forward
         self._send_backward = send_backward
         self._send_command = send_command
@@ -98,6 +99,11 @@ class Segment:
     def on_backward(self, message: Numbers, at_ns: int) -> None:
         """Take d_i from the neighbour on the tip's side."""
         self._check(message, self._d is not None)
+        if message.values[-1] not in self._setpoints:
+            raise RejectedError(
+                Reason.SETPOINT,
+                f"expected one of {self._sweep.setpoints} setpoints, got {message.values[-1]!r}",
+            )
         self._d = message.values
         self._came(2, at_ns)
         if self._x is not None:
@@ -122,21 +128,24 @@ class Segment:
 
     def _forward(self, x: Array, c: list[float]) -> None:
         if not self._last:
-            self._send_forward(self.tick, self._finite(self._sweep.forward(x, c), "forward sum"))
+            numbers = self._finite(self._sweep.forward(x, c), "forward sum")
+            self._send_forward(self.tick, self._sweep.setpoint, numbers)
 
     def _backward(self, x: Array, d: list[float]) -> None:
         if not self._first:
-            self._send_backward(self.tick, self._finite(self._sweep.backward(x, d), "backward sum"))
+            numbers = self._finite(self._sweep.backward(x, d), "backward sum")
+            self._send_backward(self.tick, self._sweep.setpoint, numbers)
 
     def _finish(self) -> None:
         if self._x is None or self._c is None or self._d is None:
             return
         output = self._sweep.output(self._x, self._c, self._d)
         numbers = self._finite(output, "estimate or command")
-        self._send_command(self.tick, numbers[4:])
+        self._send_command(self.tick, self._sweep.next_setpoint, numbers[4:])
         sent_ns = monotonic_ns()
         held = self._x.tolist()  # xh (4), u, y (2) of this tick
-        row = [*self._y, *held[:5], *self._c, *self._d, self._at[0]]
+        schedule = (float(self._sweep.setpoint), self._sweep.bump)
+        row = [*self._y, *held[:5], *schedule, *self._c, *self._d, self._at[0]]
         if not self._first:
             row.append(self._at[1])
         if not self._last:

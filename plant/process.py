@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from plant.disturbance import DisturbanceSpec
-from plant.initial import initial_shape, legendre_profile
+from plant.initial import initial_shape
 from plant.model import ArmPlant, Array, PlantParameters
 from plant.noise import SensorNoise
 from wire import session as zsession
@@ -43,6 +43,7 @@ from wire.messages import (
     encode_stop,
     run_tag,
 )
+from wire.reference import Reference
 from wire.run_config import PlantConfig
 
 BATCH_NS = 250_000_000
@@ -66,16 +67,17 @@ class PlantProcess:
                 faces_m=run.faces_m,
                 tick_s=run.tick_s,
                 initial=initial_shape(run.initial, setpoint, arm.length_m),
-                disturbance=DisturbanceSpec(run.disturbance.name, run.disturbance.amplitude),
+                disturbance=DisturbanceSpec(**vars(run.disturbance)),
                 cells=run.plant_cells,
             )
         )
         self._noise = SensorNoise(run.seed, run.noise.velocity_y_m_per_s, run.noise.curvature_per_m)
-        self._tip = np.asarray(setpoint.tip_m)
+        self._reference = Reference.from_plain(config.reference)
         self._shape_at = np.linspace(0.0, arm.length_m, SHAPE_POINTS)
         self._regulated = _regulated_weights(np.asarray(run.faces_m))
-        curvature = legendre_profile(setpoint.curvature_per_m, arm.length_m)
-        self._rest_curvature = curvature(np.asarray(run.faces_m[:-1]))
+        self._setpoint = run.setpoint_index
+        """Whose gains the nodes use in this tick, as their last commands say."""
+        self._said = [run.setpoint_index] * self._n
         self._lock = Lock()
         self._tick = -1
         """The tick whose commands are being collected."""
@@ -180,13 +182,13 @@ class PlantProcess:
             if stop := self._interrupted(k):
                 return stop
             measured = self._plant.measure() + self._noise.sample(k, self._n)
-            row = self._state_row()
+            row = self._state_row(k)
             if not (math.isfinite(float(measured.sum())) and np.isfinite(row).all()):
                 where = self._plant.first_non_finite() or "the plant's measurement is not finite"
                 return Stop(k, "safety", f"tick {k}: {where}")
             held = np.array(self._commands)
             started_ns = self._send(k, measured)
-            if stop := self._wait(k):
+            if stop := self._wait(k) or self._agreed(k):
                 return stop
             advance_ns = monotonic_ns()
             self._plant.advance(held, k)
@@ -204,7 +206,7 @@ class PlantProcess:
         return Stop(run.ticks, "finished", f"all {run.ticks} ticks done")
 
     def _send(self, k: int, measured: Array) -> int:
-        run, setpoint = self._keys.run, self._run.setpoint_index
+        run, setpoint = self._keys.run, self._setpoint
         messages = [
             encode_numbers(Kind.MEASUREMENT, run, k, PLANT, setpoint, y) for y in measured.tolist()
         ]
@@ -235,6 +237,19 @@ class PlantProcess:
                 )
                 return Stop(k, "safety", text)
         return None
+
+    def _agreed(self, k: int) -> Stop | None:
+        """Take over the setpoint of the next tick; the order to stop if the nodes name different ones."""
+        self._setpoint = self._said[0]
+        other = [i for i, setpoint in enumerate(self._said) if setpoint != self._setpoint]
+        if not other:
+            return None
+        names = self._run.setpoint_names
+        text = (
+            f"tick {k}: {_nodes(other)} go on with another setpoint than node 0 "
+            f"({names[self._said[other[0]]]} and {names[self._setpoint]})"
+        )
+        return Stop(k, "safety", text)
 
     def _interrupted(self, k: int) -> Stop | None:
         """The order to stop that the launcher gave, if any."""
@@ -272,15 +287,19 @@ class PlantProcess:
 
     # -- records ----------------------------------------------------------------------------------
 
-    def _state_row(self) -> Array:
+    def _state_row(self, k: int) -> Array:
         """Everything about the arm at the start of a tick, in the order of `plant_channels`."""
         truth = self._plant.truth()
         tip = self._plant.tip()
-        error = float(np.hypot(*(tip - self._tip)))
-        mean_v = float(self._regulated[0] @ truth[:, 1])
-        mean_k = float(self._regulated[1] @ (truth[:, 3] - self._rest_curvature))
+        *wanted, wanted_v, wanted_k = self._reference.at(k).tolist()
+        error = float(np.hypot(*(tip - wanted)))
+        means = [
+            float(self._regulated[0] @ truth[:, 1]) - wanted_v,
+            float(self._regulated[1] @ truth[:, 3]) - wanted_k,
+        ]
         shape = self._plant.shape_at(self._shape_at)
-        parts = (truth.ravel(), tip, [error], self._plant.energy(), [mean_v, mean_k], shape.ravel())
+        energy = self._plant.energy()
+        parts = (truth.ravel(), tip, [error], wanted, energy, means, shape.ravel())
         return np.concatenate(parts)
 
     def _record(self, tick: int, row: Array, *timing: int) -> None:
@@ -322,6 +341,7 @@ class PlantProcess:
                     self._check(message.tick, index)
                     self._have[index] = True
                     self._commands[index] = message.values[0]
+                    self._said[index] = message.setpoint
                     self._received[index].add(raw)
                     if self._left == 1:
                         self._complete_ns = monotonic_ns()

@@ -19,7 +19,16 @@ import numpy as np
 from recorder.merge import Row, TickMerge
 from recorder.writer import RecordingWriter
 from wire import session as zsession
-from wire.channels import Channel, label, node_channels, plant_channels, width
+from wire.channels import (
+    COMMAND,
+    MEASUREMENT,
+    STATE,
+    Channel,
+    label,
+    node_channels,
+    plant_channels,
+    width,
+)
 from wire.child import Child, Deadline
 from wire.counters import Flow, Rejections
 from wire.errors import ExitCode
@@ -42,6 +51,8 @@ POLL_S = 0.005
 PROGRESS_S = 0.1
 FINISH_S = 10.0
 """How long to wait for the last words of processes that are alive."""
+SETPOINT_AT = len(MEASUREMENT) + len(STATE) + len(COMMAND)
+"""Where a node's row has the setpoint whose gains it uses."""
 
 
 class RecorderProcess:
@@ -68,6 +79,7 @@ class RecorderProcess:
         self._first_energy: float | None = None
         self._told_at = 0.0
         self._written = 0
+        self._setpoint = run.setpoint_index
         self._silent: set[int] = set()
         self._events: list[tuple[int, str, str, str]] = []
         """Events whose tick is not written yet: they go into the file before the ticks that follow
@@ -148,6 +160,7 @@ class RecorderProcess:
     def _write(self, ticks: Iterator[tuple[int, dict[int, Row]]]) -> None:
         for tick, rows in ticks:
             self._tell(tick)
+            self._tell_setpoint(tick, rows)
             self._writer.tick(tick, rows)
             self._last = (tick, rows)
             if tick == 0:
@@ -160,6 +173,16 @@ class RecorderProcess:
             self._events = [event for event in self._events if event[0] > tick]
             for event in due:
                 self._writer.event(*event)
+
+    def _tell_setpoint(self, tick: int, rows: dict[int, Row]) -> None:
+        """Write an event when the nodes have changed to another setpoint's gains."""
+        row = next((rows[i] for i in range(self._config.run.nodes) if i in rows), None)
+        if row is None or int(row[SETPOINT_AT]) == self._setpoint:
+            return
+        before, self._setpoint = self._setpoint, int(row[SETPOINT_AT])
+        names = self._config.run.setpoint_names
+        text = f"setpoint {names[before]} -> {names[self._setpoint]} at tick {tick}"
+        self._writer.event(tick, "info", "setpoint", text)
 
     # -- figures for the progress bar -------------------------------------------------------------
 

@@ -13,7 +13,8 @@ from typing import Any
 
 from supervise.conductor import Conductor, Interrupted, log_of
 from supervise.endpoints import choose
-from supervise.plan import Plan, RunOptions, make_plan, new_run_id, prepare
+from supervise.options import RunOptions
+from supervise.plan import Plan, make_plan, new_run_id, prepare
 from supervise.state import Outcome
 from supervise.view import View, choose_view
 from wire.errors import ExitCode, UsageError
@@ -41,8 +42,8 @@ def execute(options: RunOptions, *, quiet: bool, plot: bool) -> Result:
     endpoints = choose(options.nodes, options.transport, options.base_port, options.socket_dir)
     try:
         directory, made = _make_directory(options.out, run_id)
-        plan = make_plan(options, prepared, endpoints, run_id, directory)
-        with choose_view(options.ticks, quiet=quiet) as view:
+        plan = make_plan(prepared, endpoints, run_id, directory)
+        with choose_view(plan.run.ticks, quiet=quiet) as view:
             try:
                 outcome = _conduct(plan, view)
             except BaseException:

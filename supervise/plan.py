@@ -13,101 +13,37 @@ import platform
 import secrets
 import time
 from dataclasses import dataclass
-from functools import cached_property
 from importlib import metadata
+from itertools import pairwise
 from pathlib import Path
 
 import msgspec
 
-from deploy import Deployment, deploy
-from plant.disturbance import DisturbanceSpec
-from plant.grid import plant_cells
-from plant.initial import check_name
-from plant.noise import SensorNoise
+from deploy import Deployment, SegmentGrid, deploy
+from deploy.path import References, make_references
 from supervise.endpoints import Endpoints
 from supervise.factors_file import factors_json
-from supervise.shipped import DEFAULT_GAINS
-from supervise.spacing import parse_spacing, spacing_name
+from supervise.options import RunOptions
+from supervise.scenario import Course, settle
+from supervise.spacing import spacing_name
 from wire.artefact import GainsArtefact, digest, read_artefact
 from wire.channels import FORMAT_VERSION
 from wire.errors import UsageError
 from wire.run_config import (
-    DisturbanceConfig,
     LinkConfig,
     NodeConfig,
-    NoiseConfig,
     PlantConfig,
     RecorderConfig,
     RunConfig,
+    SchedulingConfig,
     dumps,
 )
 
 BATCH_TICKS = 32
 FLUSH_S = 0.5
-MOST_NODES = 1000
 CORES = 2
 """Two sweeps run towards each other; more cores would only add wake-ups across cores (runtime
 figures)."""
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """What the user can choose about a run; checked when made. The command line explains each."""
-
-    gains: Path = DEFAULT_GAINS
-    nodes: int = 10
-    ticks: int = 1200
-    tick_s: float = 0.1
-    seed: int = 1
-    setpoint: str = "1"
-    initial: str = "chapter"
-    disturbance: str = "chapter"
-    disturbance_amplitude: float = 1.0
-    noise_velocity: float = 1e-4
-    noise_curvature: float = 1e-3
-    plant_cells: int | None = None
-    spacing: str = "equispaced"
-    out: Path | None = None
-    transport: str = "unix"
-    base_port: int | None = None
-    socket_dir: Path | None = None
-    start_timeout_s: float = 20.0
-    deadline_s: float = 10.0
-    by_hand: tuple[int, ...] = ()
-    pin: bool = True
-
-    def __post_init__(self) -> None:
-        _at_least("--nodes", self.nodes, 2, "a chain needs a root and a tip segment")
-        if self.nodes > MOST_NODES:
-            raise UsageError(f"--nodes: expected at most {MOST_NODES}, got {self.nodes}")
-        _at_least("--ticks", self.ticks, 1, "one tick is the shortest run")
-        _at_least("--seed", self.seed, 0, "any whole number from 0 on")
-        _positive("--tick", self.tick_s, "seconds")
-        _positive("--start-timeout", self.start_timeout_s, "seconds")
-        _positive("--deadline", self.deadline_s, "seconds")
-        for node in self.by_hand:
-            if not 0 <= node < self.nodes:
-                raise UsageError(f"--by-hand {node}: expected a node 0..{self.nodes - 1}")
-        check_name(self.initial)
-        DisturbanceSpec(self.disturbance, self.disturbance_amplitude)
-        SensorNoise(self.seed, self.noise_velocity, self.noise_curvature)
-        plant_cells(self.nodes, self.plant_cells)
-        _ = self.placed
-
-    @cached_property
-    def placed(self) -> str | tuple[float, ...]:
-        """The spacing's name, or its boundaries in m; a file is read once."""
-        return parse_spacing(self.spacing, self.nodes)
-
-
-def _at_least(name: str, value: int, least: int, why: str) -> None:
-    if value < least:
-        raise UsageError(f"{name}: expected at least {least}, got {value} ({why})")
-
-
-def _positive(name: str, value: float, unit: str) -> None:
-    if not (math.isfinite(value) and value > 0.0):
-        raise UsageError(f"{name}: expected a positive number of {unit}, got {value!r}")
 
 
 @dataclass(frozen=True)
@@ -130,39 +66,87 @@ def new_run_id() -> str:
     return f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}"
 
 
-def prepare(options: RunOptions) -> tuple[GainsArtefact, Deployment]:
-    """Read the gains and deploy them; raises UsageError or GainsRefusedError."""
+@dataclass(frozen=True)
+class Prepared:
+    """A run before anything is on the disk: gains, matrices, story and reference, all of them checked."""
+
+    options: RunOptions
+    course: Course
+    artefact: GainsArtefact
+    deployment: Deployment
+    references: References
+
+
+def prepare(options: RunOptions) -> Prepared:
+    """Read scenario and gains, deploy them, find the way; raises UsageError or GainsRefusedError."""
+    course = settle(options)
     artefact = read_artefact(options.gains)
-    artefact.setpoint_index(options.setpoint)
-    return artefact, deploy(artefact, options.nodes, options.tick_s, options.placed)
+    for name in course.visited:
+        artefact.setpoint_index(name)
+    deployment = deploy(artefact, options.nodes, options.tick_s, options.placed)
+    if not course.control:
+        deployment = deployment.without_control()
+    references = make_references(
+        artefact,
+        SegmentGrid(deployment.faces_m),
+        options.tick_s,
+        course.setpoint,
+        course.first_hold_s,
+        course.legs,
+    )
+    return Prepared(options, course, artefact, deployment, references)
 
 
-def make_plan(
-    options: RunOptions,
-    prepared: tuple[GainsArtefact, Deployment],
-    endpoints: Endpoints,
-    run_id: str,
-    directory: Path,
-) -> Plan:
+def scheduling(artefact: GainsArtefact, course: Course) -> SchedulingConfig:
+    """Sectors of the setpoints that the run visits, by their tips' polar angles (theory, section 5).
+
+    Raises UsageError if two of them have their tips in one direction.
+    """
+    angles = {
+        index: math.degrees(math.atan2(*reversed(artefact.setpoints[index].tip_m)))
+        for index in map(artefact.setpoint_index, course.visited)
+    }
+    order = sorted(angles, key=lambda index: angles[index])
+    for a, b in pairwise(order):
+        if angles[b] - angles[a] < 1e-6:
+            names = [artefact.setpoints[index].name for index in (a, b)]
+            raise UsageError(
+                f"setpoints {names[0]} and {names[1]}: their tips lie in one direction from the root, so "
+                "the tip's place cannot tell which gains to use; visit only one of them"
+            )
+    return SchedulingConfig(
+        setpoints=tuple(order),
+        boundaries_deg=tuple(0.5 * (angles[a] + angles[b]) for a, b in pairwise(order)),
+        hysteresis_deg=course.hysteresis_deg,
+        bump_s=course.bump_s,
+    )
+
+
+def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: Path) -> Plan:
     """Build every process's configuration."""
-    artefact, deployment = prepared
-    setpoint = options.setpoint
-    active = artefact.setpoint_index(setpoint)
+    options, course, artefact = prepared.options, prepared.course, prepared.artefact
+    deployment, references = prepared.deployment, prepared.references
+    active = artefact.setpoint_index(course.setpoint)
     nodes = options.nodes
     run = RunConfig(
         run_id=run_id,
+        scenario=course.scenario,
         nodes=nodes,
         spacing=spacing_name(options.placed),
         faces_m=tuple(deployment.faces_m.tolist()),
         tick_s=options.tick_s,
-        ticks=options.ticks,
+        ticks=course.ticks,
         seed=options.seed,
-        setpoint=setpoint,
+        setpoint=course.setpoint,
         setpoint_names=deployment.setpoint_names,
-        initial=options.initial,
-        disturbance=DisturbanceConfig(options.disturbance, options.disturbance_amplitude),
-        noise=NoiseConfig(options.noise_velocity, options.noise_curvature),
-        plant_cells=plant_cells(nodes, options.plant_cells),
+        first_hold_s=course.first_hold_s,
+        legs=course.legs,
+        scheduling=scheduling(artefact, course),
+        control=course.control,
+        initial=course.initial,
+        disturbance=course.disturbance,
+        noise=course.noise,
+        plant_cells=course.plant_cells,
         artefact_path=str(options.gains),
         artefact_sha256=digest(artefact),
         initial_estimates=tuple(
@@ -191,14 +175,15 @@ def make_plan(
             run_id=run_id,
             index=i,
             nodes=nodes,
-            ticks=options.ticks,
+            ticks=run.ticks,
             setpoint=active,
+            scheduling=run.scheduling,
             batch_ticks=BATCH_TICKS,
             links=links(listen, connect, cores[i]),
             factors=deployment.nodes[i].to_plain(),
+            reference=references.nodes[i].to_plain(),
         )
 
-    factors = [f.setpoints[active] for f in deployment.nodes]
     return Plan(
         run=run,
         nodes=tuple(node(i) for i in range(nodes)),
@@ -206,14 +191,15 @@ def make_plan(
             run=run,
             arm=msgspec.to_builtins(artefact.arm),
             setpoint=msgspec.to_builtins(artefact.setpoints[active]),
+            reference=references.plant.to_plain(),
             batch_ticks=BATCH_TICKS,
             links=links([endpoints.plant], []),
         ),
         recorder=RecorderConfig(
             run=run,
             path=str(directory / "recording.mcap"),
-            forward_widths=tuple(f.forward_received for f in factors),
-            backward_widths=tuple(f.backward_received for f in factors),
+            forward_widths=tuple(f.forward_received for f in deployment.nodes),
+            backward_widths=tuple(f.backward_received for f in deployment.nodes),
             flush_s=FLUSH_S,
             metadata=_metadata(run, epoch_ns),
             attachments={

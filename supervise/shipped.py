@@ -1,4 +1,4 @@
-"""Where the shipped arm, gains and reference problems lie: the defaults of the command line."""
+"""Where the shipped arm, gains, scenarios and reference problems lie: the defaults of the command line."""
 
 from __future__ import annotations
 
@@ -8,3 +8,4 @@ EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 DEFAULT_ARM = EXAMPLES / "chapter_arm.toml"
 DEFAULT_GAINS = EXAMPLES / "default.gains.json"
 SUITE = EXAMPLES / "suite.toml"
+SCENARIOS = EXAMPLES / "scenarios"

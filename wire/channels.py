@@ -14,7 +14,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 SHAPE_POINTS = 33
 """Points along the arm in /plant/shape, equally spaced in arclength, root and tip included."""
 METADATA = "octarm"
@@ -23,7 +23,12 @@ SUMMARY = "summary"
 MEASUREMENT = ("velocity_y_m_per_s", "curvature_per_m")
 STATE = ("velocity_x_m_per_s", "velocity_y_m_per_s", "strain", "curvature_per_m")
 COMMAND = ("force_n_per_m",)
-TIP = ("x_m", "y_m", "error_m")
+SCHEDULE = ("setpoint", "bump_n_per_m")
+ARM_SO_FAR = ("angle_rad", "x_m", "y_m")
+"""Last numbers of a forward sum: where the estimated arm ends that leads from the root to the receiver."""
+ANNOUNCED = ("setpoint",)
+"""Last number of a backward sum: the setpoint whose gains are in use from the next tick on."""
+TIP = ("x_m", "y_m", "error_m", "reference_x_m", "reference_y_m")
 ENERGY = ("kinetic_j", "axial_j", "bending_j")
 REGULATED = ("mean_velocity_y_m_per_s", "mean_curvature_per_m")
 SHAPE = tuple(f"{axis}{i:02d}_m" for i in range(SHAPE_POINTS) for axis in "xy")
@@ -35,7 +40,8 @@ EVENT = ("level", "name", "message")
 _TEXT = {"level", "name", "message"}
 _DESCRIPTION = {
     "force_n_per_m": "transverse load per length that the plant applies from this tick to the next",
-    "error_m": "distance of the tip from the setpoint's",
+    "error_m": "distance of the tip from the reference's",
+    "bump_n_per_m": "part of the command that hides a change of gains and is faded out",
     "strain": "axial strain, dimensionless",
 }
 
@@ -92,19 +98,23 @@ def timing_fields(index: int, nodes: int) -> tuple[str, ...]:
 def node_channels(index: int, nodes: int, forward: int, backward: int) -> list[Channel]:
     """A node's channels in the order of the numbers in its telemetry rows.
 
-    `forward` and `backward` are the numbers of doubles in the sums that it receives. A channel
-    without numbers (no neighbour on that side) is left out.
+    `forward` and `backward` are the numbers of doubles in the sums that it receives, the angle and
+    position of the arm so far and the announced setpoint included. A channel without numbers (no
+    neighbour on that side) is left out.
     """
     root = f"/node/{label(index, nodes)}"
     channels = [
         Channel(f"{root}/measurement", MEASUREMENT),
         Channel(f"{root}/estimate", STATE),
         Channel(f"{root}/command", COMMAND),
+        Channel(f"{root}/schedule", SCHEDULE),
     ]
     if index > 0:
-        channels.append(Channel(f"{root}/forward_sum", tuple(f"c{i}" for i in range(forward))))
+        sums = tuple(f"c{i}" for i in range(forward - len(ARM_SO_FAR)))
+        channels.append(Channel(f"{root}/forward_sum", (*sums, *ARM_SO_FAR)))
     if index < nodes - 1:
-        channels.append(Channel(f"{root}/backward_sum", tuple(f"d{i}" for i in range(backward))))
+        sums = tuple(f"d{i}" for i in range(backward - len(ANNOUNCED)))
+        channels.append(Channel(f"{root}/backward_sum", (*sums, *ANNOUNCED)))
     channels.append(Channel(f"{root}/timing", timing_fields(index, nodes)))
     return channels
 

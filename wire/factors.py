@@ -25,6 +25,10 @@ OUTPUTS = 5
 """Numbers of a node's output: estimate (v_x, v_y, e, k), command."""
 STATES = 4
 """Numbers of a node's estimate."""
+FORWARD_EXTRA = 3
+"""Numbers behind a forward sum: angle and position (x, y) of the estimated arm so far (scheduling)."""
+BACKWARD_EXTRA = 1
+"""Numbers behind a backward sum: the setpoint whose factors are used from the next tick on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +110,14 @@ class NodeFactors:
 
     `initial_estimate` (setpoints, 4) and `initial_command` (setpoints,) are xh(0) and u(0),
     absolute, when the run starts at that setpoint: the estimate starts at the setpoint, the command
-    at its feed-forward.
+    at its feed-forward. The sums of all setpoints have the same lengths. `lengths_m` (2,): of the
+    segment, and of the stretch that its curvature bends, from the centre before to its own.
+    UsageError if something does not fit.
     """
 
     index: int
+    nodes: int
+    lengths_m: Array
     initial_estimate: Array
     initial_command: Array
     setpoints: tuple[SweepFactors, ...]
@@ -118,6 +126,7 @@ class NodeFactors:
         count = len(self.setpoints)
         if count == 0:
             raise UsageError(f"factors of node {self.index}: no setpoint; deploy the gains again")
+        first = self.setpoints[0]
         for key, shape in (("initial_estimate", (count, STATES)), ("initial_command", (count,))):
             got = getattr(self, key).shape
             if got != shape:
@@ -125,11 +134,38 @@ class NodeFactors:
                     f"factors of node {self.index}, {key}: expected shape {shape}, got {got}; "
                     "deploy the gains again"
                 )
+        if not 0 <= self.index < self.nodes:
+            raise UsageError(
+                f"factors of node {self.index}: there are {self.nodes} nodes; deploy the gains again"
+            )
+        if self.lengths_m.shape != (2,):
+            raise UsageError(
+                f"factors of node {self.index}, lengths_m: expected 2 numbers, got shape "
+                f"{self.lengths_m.shape}; deploy the gains again"
+            )
+        if any((f.W.shape, f.V.shape) != (first.W.shape, first.V.shape) for f in self.setpoints):
+            raise UsageError(
+                f"factors of node {self.index}: the sums of its setpoints differ in length; deploy "
+                "the gains again"
+            )
+
+    @property
+    def forward_received(self) -> int:
+        """Numbers in the message from the root's side (0 at the root node)."""
+        return self.setpoints[0].forward_received + FORWARD_EXTRA if self.index > 0 else 0
+
+    @property
+    def backward_received(self) -> int:
+        """Numbers in the message from the tip's side (0 at the tip node)."""
+        last = self.index == self.nodes - 1
+        return 0 if last else self.setpoints[0].backward_received + BACKWARD_EXTRA
 
     def to_plain(self) -> dict[str, Any]:
         """As a dictionary of numbers, lists and bytes."""
         return {
             "index": self.index,
+            "nodes": self.nodes,
+            "lengths_m": _pack(self.lengths_m),
             "initial_estimate": _pack(self.initial_estimate),
             "initial_command": _pack(self.initial_command),
             "setpoints": [factors.to_plain() for factors in self.setpoints],
@@ -139,13 +175,15 @@ class NodeFactors:
     def from_plain(cls, plain: Mapping[str, Any]) -> NodeFactors:
         """From `to_plain`; UsageError names what is missing or damaged."""
         try:
-            index, setpoints = plain["index"], plain["setpoints"]
+            index, nodes, setpoints = plain["index"], plain["nodes"], plain["setpoints"]
         except (KeyError, TypeError) as error:
             raise UsageError(
                 f"factors of a node: {error} is missing; deploy the gains again"
             ) from None
         return cls(
             index=int(index),
+            nodes=int(nodes),
+            lengths_m=_unpack(plain, "lengths_m"),
             initial_estimate=_unpack(plain, "initial_estimate"),
             initial_command=_unpack(plain, "initial_command"),
             setpoints=tuple(SweepFactors.from_plain(factors) for factors in setpoints),

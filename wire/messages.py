@@ -7,7 +7,7 @@ process
 
 A message is `[version, kind, run, tick, sender, setpoint, payload]`: five integers that say what it
 is and where it belongs, the index of the active setpoint (theory, section 5: one set of sweep
-matrices a setpoint), and the payload. The payload of the control kinds is a list of doubles; that
+matrices a setpoint; of a command: the setpoint of the tick in which it is applied), and the payload. The payload of the control kinds is a list of doubles; that
 of the others is stated at their encoder.
 """
 
@@ -23,7 +23,7 @@ import msgpack
 import numpy as np
 import numpy.typing as npt
 
-VERSION = 1
+VERSION = 2
 PLANT = -1
 """The sender number of the plant; nodes send their index 0..n-1."""
 FIELDS = 7

@@ -29,6 +29,9 @@ class DisturbanceConfig:
 
     name: str = "none"
     amplitude: float = 1.0
+    frequency_rad_per_s: float = 1.0
+    start_s: float = 0.0
+    duration_s: float = 10.0
 
 
 @dataclass(frozen=True)
@@ -40,10 +43,56 @@ class NoiseConfig:
 
 
 @dataclass(frozen=True)
+class LegConfig:
+    """One move of the reference: from where it is to the setpoint `to`, by way of others, then a rest."""
+
+    to: str
+    through: tuple[str, ...]
+    move_s: float
+    hold_s: float
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.move_s) and self.move_s > 0.0):
+            raise UsageError(f"move_s: expected a positive number of seconds, got {self.move_s!r}")
+        if not (math.isfinite(self.hold_s) and self.hold_s >= 0.0):
+            raise UsageError(f"hold_s: expected 0 s or more, got {self.hold_s!r}")
+
+
+@dataclass(frozen=True)
+class SchedulingConfig:
+    """Which setpoint's gains are in use: by the polar angle of the estimated tip (theory, section 5)."""
+
+    setpoints: tuple[int, ...]
+    """Indices of the setpoints that the run visits, by increasing angle of their tips."""
+    boundaries_deg: tuple[float, ...]
+    """Between neighbours of `setpoints`: midway between their tips' angles."""
+    hysteresis_deg: float
+    """How far beyond a boundary the tip must be before the setpoint changes."""
+    bump_s: float
+    """Time constant with which the command's jump at a change is faded out."""
+
+    def __post_init__(self) -> None:
+        if len(self.boundaries_deg) != len(self.setpoints) - 1:
+            raise UsageError(
+                f"boundaries_deg: expected {len(self.setpoints) - 1} numbers for "
+                f"{len(self.setpoints)} setpoints, got {len(self.boundaries_deg)}"
+            )
+        if list(self.boundaries_deg) != sorted(set(self.boundaries_deg)):
+            raise UsageError(f"boundaries_deg: expected to increase, got {self.boundaries_deg}")
+        if not (math.isfinite(self.hysteresis_deg) and self.hysteresis_deg >= 0.0):
+            raise UsageError(
+                f"hysteresis_deg: expected 0 degrees or more, got {self.hysteresis_deg!r}"
+            )
+        if not (math.isfinite(self.bump_s) and self.bump_s > 0.0):
+            raise UsageError(f"bump_s: expected a positive number of seconds, got {self.bump_s!r}")
+
+
+@dataclass(frozen=True)
 class RunConfig:
     """One run: everything that its numbers depend on, apart from the gains artefact's content."""
 
     run_id: str
+    scenario: str
     nodes: int
     spacing: str
     faces_m: tuple[float, ...]
@@ -52,7 +101,14 @@ class RunConfig:
     ticks: int
     seed: int
     setpoint: str
+    """Where the reference is at the start, and whose gains are in use then."""
     setpoint_names: tuple[str, ...]
+    first_hold_s: float
+    """How long the reference rests at the start."""
+    legs: tuple[LegConfig, ...]
+    scheduling: SchedulingConfig
+    control: bool
+    """False: the commands are the reference's own, without feedback."""
     initial: str
     disturbance: DisturbanceConfig
     noise: NoiseConfig
@@ -75,12 +131,18 @@ class RunConfig:
             raise UsageError(f"tick_s: expected a positive number of seconds, got {self.tick_s!r}")
         if len(self.faces_m) != self.nodes + 1:
             raise UsageError(f"faces_m: expected {self.nodes + 1} numbers, got {len(self.faces_m)}")
-        if self.setpoint not in self.setpoint_names:
-            raise UsageError(f"setpoint {self.setpoint!r}: not in {self.setpoint_names}")
+        if not (math.isfinite(self.first_hold_s) and self.first_hold_s >= 0.0):
+            raise UsageError(f"first_hold_s: expected 0 s or more, got {self.first_hold_s!r}")
+        for name in (self.setpoint, *(n for leg in self.legs for n in (*leg.through, leg.to))):
+            if name not in self.setpoint_names:
+                raise UsageError(f"setpoint {name!r}: not in {self.setpoint_names}")
+        count = len(self.setpoint_names)
+        if any(not 0 <= index < count for index in self.scheduling.setpoints):
+            raise UsageError(f"scheduling: setpoints {self.scheduling.setpoints} of {count}")
 
     @property
     def setpoint_index(self) -> int:
-        """Position of the active setpoint among `setpoint_names`."""
+        """Position of the setpoint at the start among `setpoint_names`."""
         return self.setpoint_names.index(self.setpoint)
 
 
@@ -113,12 +175,15 @@ class NodeConfig:
     nodes: int
     ticks: int
     setpoint: int
-    """Index of the active setpoint."""
+    """Index of the setpoint whose gains are in use at the start."""
+    scheduling: SchedulingConfig
     batch_ticks: int
     """Telemetry is sent every so many ticks."""
     links: LinkConfig
     factors: dict[str, Any]
     """The node's sweep factors and initial values, see wire.factors."""
+    reference: dict[str, Any]
+    """State and command that the node should have at each tick, see wire.reference."""
 
     def __post_init__(self) -> None:
         if self.nodes < 2 or not 0 <= self.index < self.nodes:
@@ -129,11 +194,13 @@ class NodeConfig:
 
 @dataclass(frozen=True)
 class PlantConfig:
-    """What the plant needs: the run, the arm and setpoint of the artefact (as JSON), its links."""
+    """What the plant needs: the run, the arm and first setpoint of the artefact (as JSON), its links."""
 
     run: RunConfig
     arm: dict[str, Any]
     setpoint: dict[str, Any]
+    reference: dict[str, Any]
+    """Where the tip, and the means over the arm, should be at each tick, see wire.reference."""
     batch_ticks: int
     links: LinkConfig
 

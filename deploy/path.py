@@ -1,0 +1,240 @@
+"""From the legs of a scenario to tables that nodes and plant can evaluate: shapes between setpoints.
+
+Along a leg the curvature is the polynomial in sigma that passes through the leg's setpoints (first, through,
+last; equally spaced in sigma). Nodes follow what their commands really hold (`deploy.held`); the plant measures
+against the shape that is wanted (`deploy.equilibrium`). What the arm should do at a time is then (theory, section 5)
+
+    v = r_sigma sigma',   e, k as at rest,
+    u = holding load + load of the acceleration a,   a = r_sigma (sigma'' + drag sigma') + r_sigma_sigma sigma'^2,
+
+the loads as commands of the segments (`deploy.equilibrium.inertia_load`, `deploy.feedforward`). All of it is sampled at Chebyshev points of sigma.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numpy.polynomial import chebyshev, legendre
+
+from deploy.equilibrium import Equilibrium, equilibrium, inertia_load
+from deploy.feedforward import holding_commands
+from deploy.grid import Place, SegmentGrid
+from deploy.held import Held, Holder
+from wire.artefact import Arm, GainsArtefact
+from wire.errors import OctarmError
+from wire.reference import TERMS, Leg, Reference
+from wire.run_config import LegConfig
+
+Array = npt.NDArray[np.float64]
+
+DEGREES = (12, 24, 48)
+"""Degrees in sigma to try."""
+RESOLVED = 1e-7
+"""The last coefficients of every quantity are below this share of its largest."""
+NODE = ("velocity_x_m_per_s", "velocity_y_m_per_s", "strain", "curvature_per_m", "force_n_per_m")
+"""Quantities of a node's reference, at the places of its state and command."""
+PLANT = ("tip_x_m", "tip_y_m", "mean_velocity_y_m_per_s", "mean_curvature_per_m")
+"""Quantities of the plant's reference."""
+
+
+@dataclass(frozen=True, eq=False)
+class References:
+    """The reference of a run: one table a node (`NODE`), one for the plant (`PLANT`)."""
+
+    nodes: tuple[Reference, ...]
+    plant: Reference
+
+    def states(self, tick: int) -> Array:
+        """(n, 5): state and command that all nodes should have at a tick."""
+        return np.stack([one.at(tick) for one in self.nodes])
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Quantities at p points of sigma: of the held shapes at the nodes, and of the wanted ones."""
+
+    position: Array
+    """(p, 2, n) of the outer faces."""
+    strain: Array
+    """(p, n)."""
+    curvature: Array
+    """(p, n)."""
+    holding: Array
+    """(p, n)."""
+    push: Array
+    """(p, n): commands that give the acceleration r_sigma."""
+    pull: Array
+    """(p, n): commands that give the acceleration r_sigma_sigma."""
+    tip: Array
+    """(p, 2), wanted."""
+    face_height: Array
+    """(p, n): y of the outer faces, wanted."""
+    bend: Array
+    """(p, n): curvature at the inner faces, wanted."""
+
+
+def curvature_path(artefact: GainsArtefact, names: Sequence[str]) -> Callable[[float], Array]:
+    """Curvature (Legendre series, 1/m) at sigma of the path through these setpoints, one or more."""
+    series = [artefact.setpoints[artefact.setpoint_index(name)].curvature_per_m for name in names]
+    size = max(map(len, series))
+    stacked = np.stack([np.pad(np.asarray(one), (0, size - len(one))) for one in series])
+    places = np.linspace(0.0, 1.0, len(names))
+
+    def at(sigma: float) -> Array:
+        others = sigma - places
+        weights = [
+            np.prod(np.delete(others, i)) / np.prod(np.delete(places[i] - places, i))
+            for i in range(len(names))
+        ]
+        return np.asarray(np.asarray(weights) @ stacked)
+
+    return at
+
+
+def make_references(
+    artefact: GainsArtefact,
+    grid: SegmentGrid,
+    tick_s: float,
+    start: str,
+    first_hold_s: float = 0.0,
+    legs: Sequence[LegConfig] = (),
+) -> References:
+    """Tables of a run that rests at `start` for first_hold_s and then goes through the legs.
+
+    Raises UsageError if a setpoint does not exist, or a shape on the way cannot be held.
+    """
+    moves = [_table(artefact, grid, (start,), 0.0, 0.0)]
+    if legs:
+        moves.clear()
+    begin, here = first_hold_s, start
+    for leg in legs:
+        moves.append(_table(artefact, grid, (here, *leg.through, leg.to), begin, leg.move_s))
+        begin += leg.move_s + leg.hold_s
+        here = leg.to
+    return References(
+        nodes=tuple(
+            Reference(tick_s, [Leg(t, m, nodes[i]) for t, m, nodes, _ in moves])
+            for i in range(grid.nodes)
+        ),
+        plant=Reference(tick_s, [Leg(t, m, plant) for t, m, _, plant in moves]),
+    )
+
+
+def _table(
+    artefact: GainsArtefact, grid: SegmentGrid, names: Sequence[str], begin_s: float, move_s: float
+) -> tuple[float, float, Array, Array]:
+    """Begin, duration, nodes' coefficients (n, 4, 5, degree + 1) and the plant's (4, 4, degree + 1)."""
+    path = curvature_path(artefact, names)
+    if len(names) == 1:
+        found = _sample(artefact.arm, grid, path, np.zeros(1), names)
+        return begin_s, move_s, *_coefficients(artefact.arm, grid, found, 0)
+    for degree in DEGREES:
+        points = 0.5 * (1.0 + np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)))
+        found = _sample(artefact.arm, grid, path, points, names)
+        nodes, plant = _coefficients(artefact.arm, grid, found, degree)
+        if _resolved(found, degree):
+            return begin_s, move_s, nodes, plant
+    raise OctarmError(
+        f"the way {' -> '.join(names)} is not resolved by {DEGREES[-1]} polynomials: it comes too close "
+        "to a shape that no load can hold"
+    )
+
+
+def _sample(
+    arm: Arm, grid: SegmentGrid, path: Callable[[float], Array], sigma: Array, names: Sequence[str]
+) -> _Samples:
+    what = " -> ".join(names)
+    holder = Holder(arm, grid)
+    wanted: list[tuple[Array, Equilibrium]] = []
+    held: list[Held] = []
+    for one in sigma:
+        series = path(float(one))
+        rest = equilibrium(arm, series, f"{what} at {one:.2f} of the way")
+        wanted.append((series, rest))
+        held.append(holder.hold(series, rest, held[-1] if held else None))
+    outer, inner = (
+        2.0 * grid.locations_m(place) / grid.length_m - 1.0
+        for place in (Place.OUTER_FACE, Place.INNER_FACE)
+    )
+    places = _series(np.stack([rest.position_m for _, rest in wanted]), len(sigma) - 1)
+    rates = _values(_by_sigma(places), sigma)
+
+    def accelerating(accelerations: Array) -> Array:
+        pairs = zip(wanted, accelerations, strict=True)
+        loads = [inertia_load(arm, series, one) for (series, _), one in pairs]
+        return np.stack([holding_commands(load, grid) for load in loads])
+
+    return _Samples(
+        position=np.stack([one.position_m for one in held]),
+        strain=np.stack([one.strain for one in held]),
+        curvature=np.stack([one.curvature_per_m for one in held]),
+        holding=np.stack([one.command_n_per_m for one in held]),
+        push=accelerating(rates),
+        pull=accelerating(_values(_by_sigma(_by_sigma(places)), sigma)),
+        tip=np.stack([legendre.legval(1.0, rest.position_m.T) for _, rest in wanted]),
+        face_height=np.stack([legendre.legval(outer, rest.position_m[1]) for _, rest in wanted]),
+        bend=np.stack([legendre.legval(inner, series) for series, _ in wanted]),
+    )
+
+
+def _resolved(found: _Samples, degree: int) -> bool:
+    quantities = found.position, found.strain, found.curvature, found.holding, found.push
+    for values in quantities:
+        series = np.abs(_series(values, degree))
+        if np.max(series[-2:]) > RESOLVED * np.max(series):
+            return False
+    return True
+
+
+def _series(values: Array, degree: int) -> Array:
+    """Chebyshev coefficients (degree + 1, ...) of values (degree + 1, ...) at the Chebyshev points."""
+    if degree == 0:
+        return values.copy()
+    order = np.arange(degree + 1)
+    matrix = np.cos(np.pi * np.outer(order, order + 0.5) / (degree + 1)) * 2.0 / (degree + 1)
+    matrix[0] *= 0.5
+    return np.tensordot(matrix, values, axes=1)
+
+
+def _values(series: Array, sigma: Array) -> Array:
+    """Values (p, ...) of Chebyshev series (degree + 1, ...) at sigma (p,)."""
+    return np.tensordot(chebyshev.chebvander(2.0 * sigma - 1.0, len(series) - 1), series, axes=1)
+
+
+def _by_sigma(series: Array) -> Array:
+    """Coefficients of the derivative by sigma, of the same size; sigma = (x + 1) / 2."""
+    out = np.zeros_like(series)
+    if len(series) > 1:
+        out[:-1] = 2.0 * chebyshev.chebder(series)
+    return out
+
+
+def _coefficients(arm: Arm, grid: SegmentGrid, found: _Samples, degree: int) -> tuple[Array, Array]:
+    """Coefficients of all nodes (n, 4, 5, degree + 1) and of the plant (4, 4, degree + 1)."""
+    rates = _by_sigma(_series(found.position, degree))  # (degree + 1, 2, n)
+    push = _series(found.push, degree)
+    nodes = np.zeros((grid.nodes, TERMS, len(NODE), degree + 1))
+    nodes[:, 0, 2] = _series(found.strain, degree).T
+    nodes[:, 0, 3] = _series(found.curvature, degree).T
+    nodes[:, 0, 4] = _series(found.holding, degree).T
+    nodes[:, 1, :2] = rates.transpose(2, 1, 0)
+    nodes[:, 1, 4] = arm.drag_per_s * push.T
+    nodes[:, 2, 4] = _series(found.pull, degree).T
+    nodes[:, 3, 4] = push.T
+    plant = np.zeros((TERMS, len(PLANT), degree + 1))
+    plant[0, :2] = _series(found.tip, degree).T
+    outer, inner = mean_weights(grid)
+    plant[1, 2] = _by_sigma(_series(found.face_height, degree)) @ outer
+    plant[0, 3] = _series(found.bend, degree) @ inner
+    return nodes, plant
+
+
+def mean_weights(grid: SegmentGrid) -> Array:
+    """Weights (2, n) of the means over the arm of v_y (outer faces) and of the curvature (inner faces)."""
+    middle, faces = grid.centres_m, grid.faces_m
+    outer = np.diff(np.append(middle, faces[-1]))
+    inner = np.diff(np.concatenate(([faces[0]], middle)))
+    return np.asarray(np.stack([outer, inner]) / (faces[-1] - faces[0]))

@@ -1,0 +1,89 @@
+"""What the user can choose about a run, with the defaults of the command line: the only place that has them.
+
+Between `launcher.py`, which shows and fills it, and `supervise.plan`. Nothing heavy is imported here, since every
+verb of the command line pays for it. None means: what the scenario says (`supervise.scenario`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from supervise.shipped import DEFAULT_GAINS
+from wire.errors import UsageError
+
+MOST_NODES = 1000
+DEFAULT_SCENARIO = "hold"
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Checked when made. The command line explains each."""
+
+    gains: Path = DEFAULT_GAINS
+    scenario: str = DEFAULT_SCENARIO
+    nodes: int = 10
+    ticks: int | None = None
+    tick_s: float = 0.1
+    seed: int = 1
+    setpoint: str | None = None
+    initial: str | None = None
+    disturbance: str | None = None
+    disturbance_amplitude: float | None = None
+    noise_velocity: float | None = None
+    noise_curvature: float | None = None
+    plant_cells: int | None = None
+    spacing: str = "equispaced"
+    out: Path | None = None
+    transport: str = "unix"
+    base_port: int | None = None
+    socket_dir: Path | None = None
+    start_timeout_s: float = 20.0
+    deadline_s: float = 10.0
+    by_hand: tuple[int, ...] = ()
+    pin: bool = True
+
+    def __post_init__(self) -> None:
+        from plant.disturbance import DisturbanceSpec
+        from plant.grid import plant_cells
+        from plant.initial import check_name
+        from plant.noise import SensorNoise
+
+        _at_least("--nodes", self.nodes, 2, "a chain needs a root and a tip segment")
+        if self.nodes > MOST_NODES:
+            raise UsageError(f"--nodes: expected at most {MOST_NODES}, got {self.nodes}")
+        if self.ticks is not None:
+            _at_least("--ticks", self.ticks, 1, "one tick is the shortest run")
+        _at_least("--seed", self.seed, 0, "any whole number from 0 on")
+        _positive("--tick", self.tick_s, "seconds")
+        _positive("--start-timeout", self.start_timeout_s, "seconds")
+        _positive("--deadline", self.deadline_s, "seconds")
+        for node in self.by_hand:
+            if not 0 <= node < self.nodes:
+                raise UsageError(f"--by-hand {node}: expected a node 0..{self.nodes - 1}")
+        if self.initial is not None:
+            check_name(self.initial)
+        amplitude = self.disturbance_amplitude
+        DisturbanceSpec(self.disturbance or "none", 1.0 if amplitude is None else amplitude)
+        SensorNoise(self.seed, self.noise_velocity or 0.0, self.noise_curvature or 0.0)
+        plant_cells(self.nodes, self.plant_cells)
+        _ = self.placed
+
+    @cached_property
+    def placed(self) -> str | tuple[float, ...]:
+        """The spacing's name, or its boundaries in m; a file is read once."""
+        from supervise.spacing import parse_spacing
+
+        return parse_spacing(self.spacing, self.nodes)
+
+
+def _at_least(name: str, value: int, least: int, why: str) -> None:
+    if value < least:
+        raise UsageError(f"{name}: expected at least {least}, got {value} ({why})")
+
+
+def _positive(name: str, value: float, unit: str) -> None:
+    if not (math.isfinite(value) and value > 0.0):
+        raise UsageError(f"{name}: expected a positive number of {unit}, got {value!r}")
