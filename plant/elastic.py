@@ -88,6 +88,7 @@ class ElasticForce:
         self._product = np.zeros(cells, dtype=np.complex128)
         self._product_real, self._product_imag = self._product.real, self._product.imag
         self._inverse = np.zeros(cells)
+        self._length = np.zeros(cells)
         self._moments = np.zeros(cells + 1)  # scaled bending moments; 0 at the tip
         self._moments_inner, self._moments_outer = self._moments[:-1], self._moments[1:]
         self._shear = np.zeros(cells)
@@ -104,6 +105,25 @@ class ElasticForce:
         self._scaled_axial = np.array(scale * self._axial)
         self._scaled_axial_rate = np.array(scale * self._axial / self._step)
         self._scaled_bending = scale * self._bending
+
+    @property
+    def edges(self) -> Complex:
+        """Edges (cells,) between neighbouring grid nodes at the last evaluation; do not change them."""
+        return self._edges
+
+    def normals(self, out: Complex) -> None:
+        """Fill `out` (cells,) with unit normals at grid nodes 1..cells, last evaluation.
+
+        The normal of a node stands across the mean direction of the edges beside it, at the tip across the
+        last edge.
+        """
+        np.absolute(self._edges, self._length)
+        np.divide(self._edges, self._length, self._product)
+        np.add(self._product[:-1], self._product[1:], out[:-1])
+        out[-1] = self._product[-1]
+        np.absolute(out, self._length)
+        np.divide(out, self._length, out)
+        np.multiply(out, 1j, out)
 
     @property
     def clamp(self) -> tuple[complex, float]:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice, repeat
+from itertools import repeat
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,9 @@ from plant.grid import Grid, check_faces, interpolation_matrix, load_matrix, pla
 from plant.initial import STRAIGHT, InitialShape
 from wire.artefact import Arm
 from wire.errors import UsageError
+
+if TYPE_CHECKING:
+    from plant.viscous import ViscousStep
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
@@ -86,6 +90,20 @@ def highest_frequency_rad_per_s(arm: Arm, grid: Grid, shortest_stretch: float = 
     return math.hypot(axial, bending / shortest_stretch)
 
 
+def _viscous_step(arm: Arm, grid: Grid) -> ViscousStep | None:
+    if arm.kelvin_voigt_s == 0.0:
+        return None
+    from plant.viscous import ViscousStep  # with SciPy, which the plant does without otherwise
+
+    return ViscousStep(
+        grid,
+        arm.axial_stiffness_n,
+        arm.bending_stiffness_n_m2,
+        arm.mass_per_length_kg_per_m,
+        arm.kelvin_voigt_s,
+    )
+
+
 def _initial_position(initial: InitialShape, grid: Grid) -> Complex:
     curvature = initial.curvature_per_m(grid.nodes_m[:-1])
     return rest_shape(curvature, initial.strain(grid.centres_m), grid)
@@ -96,8 +114,11 @@ class ArmPlant:
 
     Integrator: Strang splitting into drift (positions) and kick with drag (velocities; the flow of
     v_t = a - d v with a held is exact), i.e. velocity Verlet when d = 0: second order, symplectic
-    without drag. A tick is cut into equal substeps below `cfl_safety` times the stability limit 2 /
-    omega, omega of `highest_frequency_rad_per_s` at the tick's start.
+    without drag. Kelvin-Voigt damping is an implicit part of the kick (`plant.viscous`). A tick is cut
+    into equal substeps below `cfl_safety` times the stability limit 2 / omega, omega of
+    `highest_frequency_rad_per_s` at the tick's start.
+    Commands act along y, or along the normal of the present shape (`Arm.actuator`), in N per metre of
+    the arm at rest.
     """
 
     def __init__(self, parameters: PlantParameters) -> None:
@@ -109,6 +130,7 @@ class ArmPlant:
         if parameters.disturbance.name != "none":
             self._disturbance = make_disturbance(parameters.disturbance, arm)
         self._force = ElasticForce(grid, arm.axial_stiffness_n, arm.bending_stiffness_n_m2)
+        self._viscous = _viscous_step(arm, grid)
         self._position = _initial_position(parameters.initial, grid)
         self._velocity = np.zeros(grid.cells, dtype=np.complex128)  # of the free nodes 1..cells
         self._command = np.zeros(parameters.segments)
@@ -145,8 +167,22 @@ class ArmPlant:
             self._integrate(self._accelerations(command, tick, count), count)
 
     def _accelerations(self, command: Array, tick: int, count: int) -> Iterator[Complex]:
-        """Accelerations (cells,) by the loads in m/s^2, at the count + 1 ends of the substeps."""
-        held = 1j * (self._load @ command)
+        """Accelerations (cells,) by the loads in m/s^2, at the count + 1 ends of the substeps.
+
+        Each must be asked for after the force has been evaluated at that end: loads along the normal turn
+        with the shape.
+        """
+        held = self._load @ command
+        if self.parameters.arm.actuator == "transverse":
+            yield from self._disturbed(np.asarray(1j * held), tick, count)
+            return
+        normals = np.empty(self._grid.cells, dtype=np.complex128)
+        for disturbance in self._disturbed(np.zeros_like(normals), tick, count):
+            self._force.normals(normals)
+            yield held * normals + disturbance
+
+    def _disturbed(self, held: Complex, tick: int, count: int) -> Iterator[Complex]:
+        """`held` and the disturbance's acceleration (cells,), at the count + 1 ends of the substeps."""
         if self._disturbance is None:
             yield from repeat(held, count + 1)
             return
@@ -174,19 +210,28 @@ class ArmPlant:
             force.evaluate,
         )
         scale, load = np.array(gain), np.empty_like(kick)
-        moved = step * self._velocity
+        before, viscous = step * self._velocity, self._viscous
         evaluate(position)
-        moved = half_decay * moved + (half / reach) * (kick + gain * next(accelerations))
-        for acceleration in islice(accelerations, count - 1):
+        moved = half_decay * before + (half / reach) * (kick + gain * next(accelerations))
+        if viscous is not None:
+            moved = viscous.apply(force.edges, before, moved, half)
+        for _ in range(count - 1):
             np.add(free, moved, free)
             evaluate(position)
+            if viscous is not None:
+                before = moved.copy()
             np.multiply(moved, decay, moved)
             np.add(moved, kick, moved)
-            np.multiply(acceleration, scale, load)
+            np.multiply(next(accelerations), scale, load)
             np.add(moved, load, moved)
+            if viscous is not None:
+                moved = viscous.apply(force.edges, before, moved, reach)
         np.add(free, moved, free)
         evaluate(position)
-        moved = half_decay * moved + (half / reach) * (kick + gain * next(accelerations))
+        before = moved
+        moved = half_decay * before + (half / reach) * (kick + gain * next(accelerations))
+        if viscous is not None:
+            moved = viscous.apply(force.edges, before, moved, half)
         self._velocity = moved / step
 
     @property
@@ -250,6 +295,12 @@ class ArmPlant:
         self._force.set_scale(1.0)
         self._force.evaluate(self._position)
         internal, moment = self._force.clamp
+        if self._viscous is not None:
+            # what the free nodes feel, and its moment, is what the clamp gives
+            feel = self._viscous.rate(self._force.edges, self._velocity)
+            feel *= self.parameters.arm.mass_per_length_kg_per_m * self._grid.step_m
+            internal += complex(np.sum(feel))
+            moment += float(np.sum((self._position[1:].conj() * feel).imag))
         return -internal.real, -internal.imag, -moment
 
     def first_non_finite(self) -> str | None:
