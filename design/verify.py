@@ -67,6 +67,7 @@ def arm_matrices(
     y_share = np.stack([grid.dual_widths_m(p) for p in MEASUREMENT_PLACES], axis=1).ravel() / length
     y_scale = np.sqrt(y_share) / y_unit
     u_share = grid.dual_widths_m(COMMAND_PLACES[0]) / length
+    u_share[0] += grid.centres_m[0] / length  # the arm carries the first command from the clamp on
     u_scale = np.sqrt(u_share) / load
     outputs = np.zeros((2, 4 * nodes))
     outputs[0, 1::4] = np.sqrt(share[1::4])
