@@ -61,6 +61,8 @@ class Simulation:
     """(K,) distance of the tip from the setpoint's."""
     shapes_m: Array
     """(K, p, 2): positions at the arclengths asked for."""
+    plant_state: Array
+    """The plant's state at the end, see `ArmPlant.state`."""
     diverged_at: int | None
     """The tick at which a number was not finite any more, where the simulation stopped; None if none."""
 
@@ -88,6 +90,7 @@ def simulate(
     dead_sensors: Sequence[int] = (),
     dead_actuators: Sequence[int] = (),
     feedback: Array | None = None,
+    step: DenseStep | None = None,
     shape_at_m: Sequence[float] = (),
     deployment: Deployment | None = None,
 ) -> Simulation:
@@ -99,7 +102,8 @@ def simulate(
     0 m/s and 0 1/m, absolute and without noise (at a curved setpoint that is not "no deviation").
     dead_actuators: nodes whose load is 0 N/m, the holding load included, while the observer believes the
     command. feedback: (n, 4n), u(k) - u_e = feedback (xh(k) - x_e) flattened node by node, in the place
-    of the artefact's controller; zeros leave the holding load. shape_at_m: arclengths whose positions are
+    of the artefact's controller; zeros leave the holding load. step: another tick altogether in the place of
+    the deployed one, with the same inputs and outputs. shape_at_m: arclengths whose positions are
     kept. deployment: of the same artefact, nodes, tick and spacing, if it is there already; saves its time.
 
     Raises UsageError for a setpoint, node or number that does not exist or fit.
@@ -127,7 +131,7 @@ def simulate(
         )
     )
     sensors = SensorNoise(seed, noise.velocity_y_m_per_s, noise.curvature_per_m)
-    step = deployed.dense[index]
+    step = step or deployed.dense[index]
     if feedback is not None:
         step = with_feedback(step, feedback)
     points = np.asarray(shape_at_m, dtype=np.float64)
@@ -165,6 +169,7 @@ def simulate(
         tip_m=tip[:done],
         tip_error_m=np.hypot(error[:, 0], error[:, 1]),
         shapes_m=shapes[:done],
+        plant_state=plant.state,
         diverged_at=None if done == ticks else done,
     )
 

@@ -1,0 +1,59 @@
+"""Many independent calls on several processors, for the studies; results in order, progress as they come."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+Result = TypeVar("Result")
+_THREADS = "OPENBLAS_NUM_THREADS"
+
+
+def call_all(
+    function: Callable[..., Result],
+    arguments: Sequence[tuple[Any, ...]],
+    jobs: int | None = None,
+    done: Callable[[int], None] | None = None,
+) -> list[Result]:
+    """`function(*a)` for each a; `jobs` processes at once, by default one a processor, 1 stays in this one.
+
+    `done` is told how many calls are finished. An exception of a call ends all and is raised here.
+    """
+    jobs = min(jobs or len(os.sched_getaffinity(0)), len(arguments))
+    if jobs <= 1:
+        out = []
+        for count, one in enumerate(arguments):
+            out.append(function(*one))
+            if done:
+                done(count + 1)
+        return out
+    context = multiprocessing.get_context("spawn")
+    with _one_thread(), ProcessPoolExecutor(jobs, context) as pool:
+        futures = [pool.submit(function, *one) for one in arguments]
+        try:
+            for count, future in enumerate(as_completed(futures)):
+                future.result()
+                if done:
+                    done(count + 1)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        return [future.result() for future in futures]
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Linear algebra of the processes started meanwhile keeps to one processor each."""
+    before = os.environ.get(_THREADS)
+    os.environ[_THREADS] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_THREADS]
+        else:
+            os.environ[_THREADS] = before
