@@ -96,10 +96,8 @@ def central_run(recording: Recording, ticks: int) -> CentralRun:
         then = references.states(k + 1)
         inputs = np.concatenate([state, recording.measurements[k]], axis=1)
         following = steps[active].about(inputs, now, then)
-        if changed:
-            bump = (state[:, 4] - now[:, 4]) - (following[:, 4] - then[:, 4])
-        else:
-            bump = bump * fade
+        jump = (state[:, 4] - now[:, 4]) - (following[:, 4] - then[:, 4])
+        bump = jump if changed else bump * fade
         following[:, 4] += bump
         # What the tip node announces in this tick, it has decided by the estimate of the tick before.
         tip = face_positions(state[:, :4], faces)[-1]

@@ -31,15 +31,21 @@ def profiles(grid: SegmentGrid, s_m: Array) -> Array:
     return np.stack([np.interp(s_m, faces, row) for row in np.eye(grid.nodes)], axis=1)
 
 
-def holding_commands(series_n_per_m: Sequence[float], grid: SegmentGrid) -> Array:
-    """Commands (n,) in N/m whose load is nearest in L2 to the Legendre series f_e(s) (theory, section 5)."""
+def projection(grid: SegmentGrid, modes: int) -> Array:
+    """Matrix (n, modes): commands whose load is nearest in L2 to each Legendre function of 2 s / L - 1."""
     x, w = legendre.leggauss(GAUSS)
     widths = grid.cell_widths_m
     points = (grid.faces_m[:-1, None] + 0.5 * widths[:, None] * (x + 1.0)).ravel()
     weights = (0.5 * widths[:, None] * w).ravel()
     hats = profiles(grid, points)
-    load = legendre.legval(2.0 * points / grid.length_m - 1.0, np.asarray(series_n_per_m))
-    return np.asarray(np.linalg.solve(hats.T * weights @ hats, hats.T @ (weights * load)))
+    waves = legendre.legvander(2.0 * points / grid.length_m - 1.0, modes - 1)
+    return np.asarray(np.linalg.solve(hats.T * weights @ hats, hats.T @ (weights[:, None] * waves)))
+
+
+def holding_commands(series_n_per_m: Sequence[float] | Array, grid: SegmentGrid) -> Array:
+    """Commands (n,) in N/m whose load is nearest in L2 to the Legendre series f_e(s) (theory, section 5)."""
+    series = np.asarray(series_n_per_m, dtype=np.float64)
+    return np.asarray(projection(grid, len(series)) @ series)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,9 +61,9 @@ class Holding:
 
 def holding(
     arm: Arm,
-    curvature_per_m: Sequence[float],
-    strain: Sequence[float],
-    load_n_per_m: Sequence[float],
+    curvature_per_m: Sequence[float] | Array,
+    strain: Sequence[float] | Array,
+    load_n_per_m: Sequence[float] | Array,
     grid: SegmentGrid,
 ) -> Holding:
     """Commands whose bending moment is nearest in L2 to that of the shape's own load.
@@ -96,6 +102,6 @@ def holding(
     return Holding(commands, change)
 
 
-def _series(coefficients: Sequence[float], s_m: Array, grid: SegmentGrid) -> Array:
+def _series(coefficients: Sequence[float] | Array, s_m: Array, grid: SegmentGrid) -> Array:
     scaled = 2.0 * s_m / grid.length_m - 1.0
     return np.asarray(legendre.legval(scaled, np.asarray(coefficients, dtype=np.float64)))

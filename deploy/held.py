@@ -1,8 +1,8 @@
 """The shape that n commands really hold, as near as possible to the one that is wanted.
 
-Between the equilibrium of a smooth load (`deploy.equilibrium`) and the reference of a run (`deploy.path`). The
-segments' load is piecewise linear, and where the wanted load changes within a segment (setpoint 3) its L2
-projection holds the tip a centimetre beside the wanted place. Here the commands are chosen by the shape instead:
+Between the equilibrium of a smooth load (`deploy.equilibrium`) and the reference of a run (`deploy.path`).
+The segments' load is piecewise linear, and where the wanted load changes within a segment (setpoint 3) its L2
+projection holds the tip a centimetre beside the wanted place. Here the commands are chosen by the shape:
 least squares of the angle over the arm, with the exact statics, on a grid much finer than the segments'.
 
 The load is transverse and dead, so the internal force is known before the shape: N = (0, N_y), N_y = the load
@@ -15,15 +15,16 @@ solved by Newton's method with a tridiagonal matrix; the commands by Gauss-Newto
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import legendre
-from scipy.linalg import solve_banded
+from scipy.linalg import lapack
 
-from deploy.equilibrium import Equilibrium
-from deploy.feedforward import holding, holding_commands, profiles
+from deploy.equilibrium import SIZE, Equilibrium
+from deploy.feedforward import holding, profiles, projection
 from deploy.grid import Place, SegmentGrid
 from deploy.model import tangent_angle
 from wire.artefact import Arm
@@ -35,8 +36,12 @@ CELLS = 800
 """Of the grid that the statics are solved on."""
 NEWTON = 40
 GAUSS_NEWTON = 12
-CONVERGED = 1e-10
-"""Change of the angle in rad, and of the commands relative to the largest, that ends an iteration."""
+HALVINGS = 8
+ANGLE_RAD = 1e-9
+"""A change of the angle that ends Newton's method; it is quadratic, so the angle is exact to rounding then."""
+CONVERGED = 1e-9
+"""A change of the commands, relative to the largest, that ends Gauss-Newton."""
+SMALLEST_N_PER_M = 1e-12
 WEAKEST = 1e-5
 """Loads that turn the arm less than this share of the most effective one keep their first values."""
 
@@ -53,8 +58,10 @@ class Held:
     """(n,) at the inner faces."""
     position_m: Array
     """(2, n): x and y of the outer faces."""
+    misfit_n_per_m: Array | None = None
+    """(n,) commands less the L2 projection of the smooth load."""
     angle_rad: Array | None = None
-    """(CELLS,): for the next shape to start from."""
+    """(CELLS,), both for the next shape to start from."""
 
 
 class Holder:
@@ -63,6 +70,7 @@ class Holder:
     def __init__(self, arm: Arm, grid: SegmentGrid) -> None:
         self._arm, self._grid = arm, grid
         self._statics = _Statics(arm, grid) if arm.actuator == "transverse" else None
+        self._projection = projection(grid, SIZE)
 
     def hold(self, curvature_per_m: Array, rest: Equilibrium, near: Held | None = None) -> Held:
         """Commands whose shape is as near as possible to this one, and the shape that they hold.
@@ -73,9 +81,7 @@ class Holder:
         """
         grid = self._grid
         if self._statics is not None:
-            first = holding_commands(rest.load_n_per_m, grid)
-            angle = None if near is None else near.angle_rad
-            return self._statics.hold(curvature_per_m, first, angle)
+            return self._statics.hold(curvature_per_m, self.commands(rest.load_n_per_m), near)
         found = holding(self._arm, curvature_per_m, rest.strain, rest.load_n_per_m, grid)
         outer, centre, inner = (
             2.0 * grid.locations_m(place) / grid.length_m - 1.0
@@ -83,10 +89,39 @@ class Holder:
         )
         return Held(
             command_n_per_m=found.commands_n_per_m,
-            strain=legendre.legval(centre, rest.strain),
-            curvature_per_m=legendre.legval(inner, curvature_per_m) + found.curvature_change_per_m,
-            position_m=legendre.legval(outer, rest.position_m.T),
+            strain=_at(centre, rest.strain),
+            curvature_per_m=_at(inner, curvature_per_m) + found.curvature_change_per_m,
+            position_m=np.stack([_at(outer, one) for one in rest.position_m]),
         )
+
+    def commands(self, load_n_per_m: Array) -> Array:
+        """L2 projection (n,) of a load, a series of `SIZE` coefficients."""
+        return np.asarray(self._projection @ load_n_per_m)
+
+
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """A shape at rest on the fine grid, and what is needed for its change with the load; all (CELLS,)."""
+
+    angle: Array
+    strain: Array
+    beside: Array
+    """(CELLS - 1,): the Jacobian's other diagonals."""
+    diagonal: Array
+    pull: Array
+    """Of the balance by the force N_y."""
+
+    def turns(self, force: Array) -> Array:
+        """Change of the angle (CELLS, n) per command; force: N_y (CELLS, n) per command."""
+        return _tridiagonal(self.beside, self.diagonal, -self.pull[:, None] * force)
+
+
+def _tridiagonal(beside: Array, diagonal: Array, right: Array) -> Array:
+    return np.asarray(lapack.dgtsv(beside, diagonal, beside, right)[3], dtype=np.float64)
+
+
+def _at(places: Array, series: Array) -> Array:
+    return np.asarray(legendre.legval(places, series), dtype=np.float64)
 
 
 class _Statics:
@@ -95,71 +130,69 @@ class _Statics:
     def __init__(self, arm: Arm, grid: SegmentGrid) -> None:
         self._arm, self._grid = arm, grid
         self._step = arm.length_m / CELLS
-        self.centres_m = (np.arange(CELLS) + 0.5) * self._step
-        halves = (np.arange(2 * CELLS) + 0.5) * 0.5 * self._step
+        self.centres_m: Array = np.linspace(0.5, CELLS - 0.5, CELLS) * self._step
+        halves = np.linspace(0.25, CELLS - 0.25, 2 * CELLS) * self._step
         pieces = profiles(grid, halves) * (0.5 * self._step)
         beyond = np.cumsum(pieces[::-1], axis=0)[::-1]
         self._force = beyond[1::2]  # (CELLS, n): N_y at the cells' centres per command
         self._ends = np.arange(CELLS + 1) * self._step
 
-    def hold(
-        self, curvature_per_m: Array, first_n_per_m: Array, angle_rad: Array | None = None
-    ) -> Held:
+    def hold(self, curvature_per_m: Array, first_n_per_m: Array, near: Held | None) -> Held:
         """Commands whose shape has nearly this curvature (Legendre series), and that shape.
 
-        first_n_per_m: commands to start from, which matter only where they hardly turn the arm; angle_rad
-        (CELLS,): a shape to start from. Raises OctarmError if no shape is found.
+        first_n_per_m: commands to start from, which matter only where they hardly turn the arm; near: a similar
+        shape, to start from it instead. Raises OctarmError if no shape is found.
         """
         wanted = tangent_angle(curvature_per_m, self.centres_m, self._arm.length_m)
-        command, angle = first_n_per_m, wanted if angle_rad is None else angle_rad
-        angle, strain, matrix = self._shape(command, angle)
-        misfit = float(np.linalg.norm(angle - wanted))
+        command, start = first_n_per_m, wanted
+        if near is not None and near.misfit_n_per_m is not None and near.angle_rad is not None:
+            command, start = first_n_per_m + near.misfit_n_per_m, near.angle_rad
+        shape = self._shape(command, start)
+        if shape is None:
+            raise OctarmError("no shape of the arm balances the load of the segments on the way")
         for _ in range(GAUSS_NEWTON):
-            turns = self._sensitivity(angle, strain, matrix)
+            turns = shape.turns(self._force)
             weight = WEAKEST * np.linalg.norm(turns, 2) * np.eye(len(command))
-            change = np.linalg.lstsq(
-                np.vstack([turns, weight]),
-                np.concatenate([wanted - angle, weight @ (first_n_per_m - command)]),
-                rcond=None,
-            )[0]
-            for _ in range(8):  # a step that makes the misfit larger is cut in half
-                angle, strain, matrix = self._shape(command + change, angle)
-                now = float(np.linalg.norm(angle - wanted))
-                if now <= misfit * (1.0 + 1e-9) + 1e-12:
-                    break
+            right = np.concatenate([wanted - shape.angle, weight @ (first_n_per_m - command)])
+            change = np.linalg.lstsq(np.vstack([turns, weight]), right, rcond=None)[0]
+            misfit = float(np.linalg.norm(shape.angle - wanted))
+            for _ in range(HALVINGS):  # a step that makes the misfit larger is cut in half
+                after = self._shape(command + change, shape.angle)
+                if after is not None:
+                    now = float(np.linalg.norm(after.angle - wanted))
+                    if now <= misfit * (1.0 + 1e-6) + 1e-9:
+                        break
                 change = 0.5 * change
-            command, misfit = command + change, now
-            if np.max(np.abs(change)) <= CONVERGED * max(np.max(np.abs(command)), 1e-6):
+            if after is None:
                 break
-        return self._held(command, angle, strain)
+            command, shape = command + change, after
+            if np.max(np.abs(change)) <= CONVERGED * np.max(np.abs(command)) + SMALLEST_N_PER_M:
+                break
+        return self._held(command, first_n_per_m, shape)
 
-    def _shape(self, command: Array, angle: Array) -> tuple[Array, Array, Array]:
-        """Angle and strain (CELLS,) under commands, and the Jacobian's bands (3, CELLS)."""
+    def _shape(self, command: Array, angle: Array) -> _Shape | None:
+        """The shape under commands, None if Newton's method does not find it from this angle (CELLS,)."""
         arm, step = self._arm, self._step
-        bending, axial = arm.bending_stiffness_n_m2, arm.axial_stiffness_n
+        bending, axial = arm.bending_stiffness_n_m2 / step**2, arm.axial_stiffness_n
         force = self._force @ command
-        bands = np.full((3, CELLS), bending / step**2)
+        beside = np.full(CELLS - 1, bending)
         for _ in range(NEWTON):
             sine, cosine = np.sin(angle), np.cos(angle)
             strain = force * sine / axial
-            residual = bending * np.diff(self._curvature(angle)) / step
+            residual = bending * step * np.diff(self._curvature(angle))
             residual += force * (1.0 + strain) * cosine
-            bands[1] = -2.0 * bending / step**2
-            bands[1] += force * (force * cosine**2 / axial - (1.0 + strain) * sine)
-            bands[1, 0] -= bending / step**2
-            bands[1, -1] += bending / step**2
-            change = solve_banded((1, 1), bands, residual, check_finite=False)
+            diagonal = force * (force * cosine**2 / axial - (1.0 + strain) * sine) - 2.0 * bending
+            diagonal[0] -= bending
+            diagonal[-1] += bending
+            change = _tridiagonal(beside, diagonal, residual)
             angle = angle - change
-            if not np.isfinite(angle).all():
-                break
-            if np.max(np.abs(change)) < CONVERGED:
-                return angle, force * np.sin(angle) / axial, bands
-        raise OctarmError("no shape of the arm balances the load of the segments on the way")
-
-    def _sensitivity(self, angle: Array, strain: Array, bands: Array) -> Array:
-        """Change of the angle per command, (CELLS, n)."""
-        pull = ((1.0 + 2.0 * strain) * np.cos(angle))[:, None] * self._force
-        return np.asarray(solve_banded((1, 1), bands, -pull, check_finite=False))
+            largest = float(np.max(np.abs(change)))
+            if not largest < math.pi:  # nor if it is no number
+                return None
+            if largest < ANGLE_RAD:
+                pull = (1.0 + 2.0 * strain) * cosine
+                return _Shape(angle, force * np.sin(angle) / axial, beside, diagonal, pull)
+        return None
 
     def _curvature(self, angle: Array) -> Array:
         """At the cells' ends (CELLS + 1,); the arm leaves the clamp straight, its tip bears no moment."""
@@ -168,8 +201,8 @@ class _Statics:
         out[1:-1] = np.diff(angle) / self._step
         return out
 
-    def _held(self, command: Array, angle: Array, strain: Array) -> Held:
-        grid = self._grid
+    def _held(self, command: Array, first: Array, shape: _Shape) -> Held:
+        grid, angle, strain = self._grid, shape.angle, shape.strain
         edges = self._step * (1.0 + strain) * np.stack([np.cos(angle), np.sin(angle)])
         places = np.hstack([np.zeros((2, 1)), np.cumsum(edges, axis=1)])
         outer = grid.locations_m(Place.OUTER_FACE)
@@ -180,5 +213,6 @@ class _Statics:
                 grid.locations_m(Place.INNER_FACE), self._ends, self._curvature(angle)
             ),
             position_m=np.stack([np.interp(outer, self._ends, one) for one in places]),
+            misfit_n_per_m=command - first,
             angle_rad=angle,
         )

@@ -40,7 +40,7 @@ class GridModel:
     """(n, 4), J per unit squared, see `SegmentGrid.energy_weights`."""
 
 
-def tangent_angle(curvature_per_m: Sequence[float], s_m: Array, length_m: float) -> Array:
+def tangent_angle(curvature_per_m: Sequence[float] | Array, s_m: Array, length_m: float) -> Array:
     """theta_e(s) in rad, the integral of the curvature from the root, exact for the series."""
     series = np.asarray(curvature_per_m, dtype=np.float64)
     integral = legendre.legint(series, lbnd=-1.0, scl=1.0) * (0.5 * length_m)

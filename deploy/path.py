@@ -2,12 +2,14 @@
 
 Along a leg the curvature is the polynomial in sigma that passes through the leg's setpoints (first, through,
 last; equally spaced in sigma). Nodes follow what their commands really hold (`deploy.held`); the plant measures
-against the shape that is wanted (`deploy.equilibrium`). What the arm should do at a time is then (theory, section 5)
+against the shape that is wanted (`deploy.equilibrium`). What the arm should do at a time is then (theory, 5)
 
     v = r_sigma sigma',   e, k as at rest,
-    u = holding load + load of the acceleration a,   a = r_sigma (sigma'' + drag sigma') + r_sigma_sigma sigma'^2,
+    u = holding load + load of the acceleration a,
+    a = r_sigma (sigma'' + drag sigma') + r_sigma_sigma sigma'^2,
 
-the loads as commands of the segments (`deploy.equilibrium.inertia_load`, `deploy.feedforward`). All of it is sampled at Chebyshev points of sigma.
+the loads as commands of the segments (`deploy.equilibrium.inertia_load`, `deploy.feedforward`). All of it is
+sampled at Chebyshev points of sigma.
 """
 
 from __future__ import annotations
@@ -19,9 +21,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import chebyshev, legendre
 
-from deploy.equilibrium import Equilibrium, equilibrium, inertia_load
-from deploy.feedforward import holding_commands
-from deploy.grid import Place, SegmentGrid
+from deploy.equilibrium import SIZE, Equilibrium, equilibrium, inertia_load, series_of
+from deploy.grid import SegmentGrid
 from deploy.held import Held, Holder
 from wire.artefact import Arm, GainsArtefact
 from wire.errors import OctarmError
@@ -106,12 +107,25 @@ def make_references(
 
     Raises UsageError if a setpoint does not exist, or a shape on the way cannot be held.
     """
-    moves = [_table(artefact, grid, (start,), 0.0, 0.0)]
-    if legs:
-        moves.clear()
+    tables: dict[tuple[str, ...], tuple[Array, Array]] = {}
+    holder = Holder(artefact.arm, grid)
+
+    def table(names: tuple[str, ...]) -> tuple[Array, Array]:
+        if names not in tables:
+            back = tables.get(names[::-1])
+            tables[names] = (
+                _table(artefact, grid, holder, names)
+                if back is None
+                else (_reversed(back[0]), _reversed(back[1]))
+            )
+        return tables[names]
+
+    moves: list[tuple[float, float, Array, Array]] = []
+    if not legs:
+        moves.append((0.0, 0.0, *table((start,))))
     begin, here = first_hold_s, start
     for leg in legs:
-        moves.append(_table(artefact, grid, (here, *leg.through, leg.to), begin, leg.move_s))
+        moves.append((begin, leg.move_s, *table((here, *leg.through, leg.to))))
         begin += leg.move_s + leg.hold_s
         here = leg.to
     return References(
@@ -124,30 +138,40 @@ def make_references(
 
 
 def _table(
-    artefact: GainsArtefact, grid: SegmentGrid, names: Sequence[str], begin_s: float, move_s: float
-) -> tuple[float, float, Array, Array]:
-    """Begin, duration, nodes' coefficients (n, 4, 5, degree + 1) and the plant's (4, 4, degree + 1)."""
-    path = curvature_path(artefact, names)
+    artefact: GainsArtefact, grid: SegmentGrid, holder: Holder, names: Sequence[str]
+) -> tuple[Array, Array]:
+    """Coefficients of the nodes (n, 4, 5, degree + 1) and of the plant (4, 4, degree + 1) on one leg."""
+    arm, path = artefact.arm, curvature_path(artefact, names)
     if len(names) == 1:
-        found = _sample(artefact.arm, grid, path, np.zeros(1), names)
-        return begin_s, move_s, *_coefficients(artefact.arm, grid, found, 0)
+        found = _sample(arm, grid, holder, path, np.zeros(1), names)
+        return _coefficients(arm, grid, found, 0)
     for degree in DEGREES:
         points = 0.5 * (1.0 + np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1)))
-        found = _sample(artefact.arm, grid, path, points, names)
-        nodes, plant = _coefficients(artefact.arm, grid, found, degree)
+        found = _sample(arm, grid, holder, path, points, names)
         if _resolved(found, degree):
-            return begin_s, move_s, nodes, plant
+            return _coefficients(arm, grid, found, degree)
     raise OctarmError(
         f"the way {' -> '.join(names)} is not resolved by {DEGREES[-1]} polynomials: it comes too close "
         "to a shape that no load can hold"
     )
 
 
+def _reversed(coefficients: Array) -> Array:
+    """The same way backwards, sigma -> 1 - sigma; coefficients (..., 4, quantities, degree + 1)."""
+    flips = np.array([1.0, -1.0, 1.0, -1.0])  # of sigma' and sigma'', as factors and as arguments
+    parity = (-1.0) ** np.arange(coefficients.shape[-1])
+    return np.ascontiguousarray(coefficients * flips[:, None, None] * parity)
+
+
 def _sample(
-    arm: Arm, grid: SegmentGrid, path: Callable[[float], Array], sigma: Array, names: Sequence[str]
+    arm: Arm,
+    grid: SegmentGrid,
+    holder: Holder,
+    path: Callable[[float], Array],
+    sigma: Array,
+    names: Sequence[str],
 ) -> _Samples:
     what = " -> ".join(names)
-    holder = Holder(arm, grid)
     wanted: list[tuple[Array, Equilibrium]] = []
     held: list[Held] = []
     for one in sigma:
@@ -155,28 +179,27 @@ def _sample(
         rest = equilibrium(arm, series, f"{what} at {one:.2f} of the way")
         wanted.append((series, rest))
         held.append(holder.hold(series, rest, held[-1] if held else None))
-    outer, inner = (
-        2.0 * grid.locations_m(place) / grid.length_m - 1.0
-        for place in (Place.OUTER_FACE, Place.INNER_FACE)
+    waves_outer, waves_inner, waves_tip = (
+        legendre.legvander(2.0 * places / grid.length_m - 1.0, SIZE - 1)
+        for places in (grid.faces_m[1:], grid.faces_m[:-1], grid.faces_m[-1:])
     )
-    places = _series(np.stack([rest.position_m for _, rest in wanted]), len(sigma) - 1)
-    rates = _values(_by_sigma(places), sigma)
+    positions = np.stack([rest.position_m for _, rest in wanted])
+    series = _series(positions, len(sigma) - 1)
 
     def accelerating(accelerations: Array) -> Array:
         pairs = zip(wanted, accelerations, strict=True)
-        loads = [inertia_load(arm, series, one) for (series, _), one in pairs]
-        return np.stack([holding_commands(load, grid) for load in loads])
+        return np.stack([holder.commands(inertia_load(arm, bend, one)) for (bend, _), one in pairs])
 
     return _Samples(
         position=np.stack([one.position_m for one in held]),
         strain=np.stack([one.strain for one in held]),
         curvature=np.stack([one.curvature_per_m for one in held]),
         holding=np.stack([one.command_n_per_m for one in held]),
-        push=accelerating(rates),
-        pull=accelerating(_values(_by_sigma(_by_sigma(places)), sigma)),
-        tip=np.stack([legendre.legval(1.0, rest.position_m.T) for _, rest in wanted]),
-        face_height=np.stack([legendre.legval(outer, rest.position_m[1]) for _, rest in wanted]),
-        bend=np.stack([legendre.legval(inner, series) for series, _ in wanted]),
+        push=accelerating(_values(_by_sigma(series), sigma)),
+        pull=accelerating(_values(_by_sigma(_by_sigma(series)), sigma)),
+        tip=(positions @ waves_tip.T)[:, :, 0],
+        face_height=positions[:, 1] @ waves_outer.T,
+        bend=np.stack([series_of(bend) for bend, _ in wanted]) @ waves_inner.T,
     )
 
 

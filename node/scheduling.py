@@ -1,8 +1,8 @@
 """Which setpoint's gains are in use: the tip node's decision from the tip's estimated place (pure mathematics).
 
 Between the sums, which bring the estimated arm's shape to the tip node and its decision to all others, and
-`node.sweep`, which takes the gains (theory, section 5). The shape comes as angle and position of the arm so far:
-every node adds its own segment.
+`node.sweep`, which takes the gains (theory, section 5). The shape comes as angle and position of the arm so
+far: every node adds its own segment.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What the user can choose about a run, with the defaults of the command line: the only place that has them.
 
-Between `launcher.py`, which shows and fills it, and `supervise.plan`. Nothing heavy is imported here, since every
-verb of the command line pays for it. None means: what the scenario says (`supervise.scenario`).
+Between `launcher.py`, which shows and fills it, and `supervise.plan`. Nothing heavy is imported here, since
+every verb of the command line pays for it. None means: what the scenario says (`supervise.scenario`).
 """
 
 from __future__ import annotations

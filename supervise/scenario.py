@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
 
@@ -117,7 +118,7 @@ def _check(scenario: Scenario) -> None:
         _seconds(f"{key}.move_s", leg.move_s, positive=True)
         _seconds(f"{key}.hold_s", leg.hold_s, positive=False)
         stations = (here, *leg.through, leg.to)
-        if any(a == b for a, b in zip(stations, stations[1:], strict=False)):
+        if any(a == b for a, b in pairwise(stations)):
             raise UsageError(
                 f"{key}: goes from a setpoint to itself ({' -> '.join(stations)}); a longer hold_s before "
                 "it rests there"

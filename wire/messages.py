@@ -2,13 +2,12 @@
 anything is off.
 
 Data flow: plant -> node (measurement), node -> node (running sums), node -> plant (command), every
-process
--> recorder (telemetry, counters), plant -> all (stop).
+process -> recorder (telemetry, counters), plant -> all (stop).
 
 A message is `[version, kind, run, tick, sender, setpoint, payload]`: five integers that say what it
 is and where it belongs, the index of the active setpoint (theory, section 5: one set of sweep
-matrices a setpoint; of a command: the setpoint of the tick in which it is applied), and the payload. The payload of the control kinds is a list of doubles; that
-of the others is stated at their encoder.
+matrices a setpoint; of a command: the setpoint of the tick in which it is applied), and the payload.
+The payload of the control kinds is a list of doubles; that of the others is stated at their encoder.
 """
 
 from __future__ import annotations
