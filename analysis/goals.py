@@ -7,7 +7,6 @@ animation and the summary.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -40,30 +39,36 @@ def setpoint_shape(setpoint: Setpoint, length_m: float, points: int = 401) -> Ar
     return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
 
-def sectors(setpoints: Sequence[Setpoint]) -> dict[int, tuple[float, float]]:
-    """Per setpoint (its index) the sector of the tip's polar angle in which it is active, rad.
+def sectors(recording: Recording) -> dict[int, tuple[float, float]]:
+    """Per setpoint that the run visits (its index) the sector of the tip's polar angle that is its, rad.
 
-    Boundaries lie midway between the angles of neighbouring setpoints' tips (theory, section 5); the
-    outermost sectors, which have no end, are drawn as far beyond their tip as within. A single
-    setpoint has none.
+    Boundaries are those of the run's scheduling, midway between neighbours' tips (theory, section 5); the
+    outermost sectors, which have no end, are drawn as far beyond their tip as within. A single setpoint
+    has none.
     """
-    angles = [math.atan2(s.tip_m[1], s.tip_m[0]) for s in setpoints]
-    order = sorted(range(len(angles)), key=angles.__getitem__)
-    if len(order) < 2:
+    scheduling = recording.configuration.scheduling
+    if len(scheduling.setpoints) < 2:
         return {}
-    middles = [0.5 * (angles[a] + angles[b]) for a, b in pairwise(order)]
-    first = 2.0 * angles[order[0]] - middles[0]
-    last = 2.0 * angles[order[-1]] - middles[-1]
-    edges = [first, *middles, last]
-    return {index: (edges[i], edges[i + 1]) for i, index in enumerate(order)}
+    tips = [recording.artefact.setpoints[index].tip_m for index in scheduling.setpoints]
+    angles = [math.atan2(y, x) for x, y in tips]
+    between = [math.radians(degrees) for degrees in scheduling.boundaries_deg]
+    edges = [2.0 * angles[0] - between[0], *between, 2.0 * angles[-1] - between[-1]]
+    return dict(zip(scheduling.setpoints, pairwise(edges), strict=True))
+
+
+def visited(recording: Recording) -> list[int]:
+    """Indices of the setpoints that the run visits, by increasing angle of their tips."""
+    return list(recording.configuration.scheduling.setpoints)
 
 
 def active_setpoints(recording: Recording) -> Ints:
-    """Index of the setpoint whose gains are in use at each tick, (K,)."""
-    return np.full(recording.ticks, recording.configuration.setpoint_index, dtype=np.int64)
+    """Index of the setpoint whose gains are in use at each tick, (K,); kept where a tick is missing."""
+    used = recording.setpoints_used
+    latest = np.maximum.accumulate(np.where(used >= 0, np.arange(used.size), -1))
+    kept = used[np.maximum(latest, 0)]
+    return np.where(latest >= 0, kept, recording.configuration.setpoint_index).astype(np.int64)
 
 
 def reference_tips(recording: Recording) -> Array:
-    """Where the tip was asked to be at each tick, (K, 2) in m: the recorded path, or the setpoint's tip."""
-    setpoint = recording.artefact.setpoints[recording.configuration.setpoint_index]
-    return np.tile(np.asarray(setpoint.tip_m, dtype=np.float64), (recording.ticks, 1))
+    """Where the tip was asked to be at each tick, (K, 2) in m."""
+    return recording.of_plant("tip", ("reference_x_m", "reference_y_m"))

@@ -3,7 +3,7 @@
 The open-loop model starts where the observer starts (xh(0), observer state zero) and is driven by
 the recorded commands with L = 0,
 
-    x(k+1) = S x(k) + F u(k)   in deviations from the setpoint (theory, section 5),
+    x(k+1) = S x(k) + F u(k)   in deviations from the reference (theory, section 5),
 
 so its error decays by the arm's own damping only; what the observer is better by is the merit of
 the measurements.
@@ -11,11 +11,13 @@ the measurements.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from analysis.goals import active_setpoints
 from analysis.metrics import (
     decay_rate,
     energy_norm,
@@ -36,14 +38,22 @@ THRESHOLD = 0.01
 """The share of the initial error whose crossing is reported."""
 
 
-def open_loop_run(step: DenseStep, initial_estimates: Array, commands: Array) -> Array:
+def open_loop_run(
+    steps: Sequence[DenseStep],
+    active: npt.NDArray[np.int64],
+    reference: Callable[[int], Array],
+    initial_estimates: Array,
+    commands: Array,
+) -> Array:
     """Estimates of the model without correction at each tick, absolute, SI.
 
-    The observer's own step with its own estimate in the measurement's place: the innovation
-    C xh - y is zero, which is the same as L = 0. initial_estimates: (n, 4); commands: (K, n) in
-    N/m, command k held over tick k. Returns (K, n, 4).
+    The observer's own steps with its own estimate in the measurement's place: the innovation
+    C xh - y is zero, which is the same as L = 0. active: (K,) which step is used at each tick;
+    reference: state and command (n, 5) that are wanted at a tick; initial_estimates: (n, 4);
+    commands: (K, n) in N/m, command k held over tick k. Returns (K, n, 4).
     """
     ticks, nodes = commands.shape
+    now = reference(0)
     out = np.empty((ticks, nodes, 4))
     inputs = np.empty((nodes, 7))
     inputs[:, :4] = initial_estimates
@@ -51,7 +61,9 @@ def open_loop_run(step: DenseStep, initial_estimates: Array, commands: Array) ->
         out[k] = inputs[:, :4]
         inputs[:, 4] = commands[k]
         inputs[:, 5:] = inputs[:, MEASURED]
-        inputs[:, :4] = step(inputs)[:, :4]
+        then = reference(k + 1)
+        inputs[:, :4] = steps[active[k]].about(inputs, now, then)[:, :4]
+        now = then
     return out
 
 
@@ -109,7 +121,9 @@ def estimation_errors(recording: Recording, estimates: Array) -> EstimationError
 def compare_with_open_loop(recording: Recording) -> tuple[EstimationErrors, EstimationErrors]:
     """Errors over time of the recorded observer and of the open-loop model, in this order."""
     model = open_loop_run(
-        recording.deployment.dense[recording.configuration.setpoint_index],
+        recording.deployment.dense,
+        active_setpoints(recording),
+        recording.references.states,
         recording.initial_estimates,
         recording.commands,
     )

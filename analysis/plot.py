@@ -7,6 +7,7 @@ colour-blind readers.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,11 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
-from analysis.goals import setpoint_shape
+from analysis.goals import active_setpoints, colour, reference_tips, setpoint_shape, visited
+from analysis.legs import NEAR_M, make_legs
 from analysis.open_loop import THRESHOLD, ErrorCourse, EstimationErrors, compare_with_open_loop
 from analysis.recording import Recording, read_recording
 from wire.errors import UsageError
@@ -75,9 +78,11 @@ def draw_run(recording: Recording) -> Figure:
         FigureCanvasAgg(figure)
         axes = figure.subplots(2, 3)
         observer, model = compare_with_open_loop(recording)
-        draw_shapes(axes[0, 0], recording)
-        draw_estimation(axes[0, 1], recording, observer, model)
-        draw_tip(axes[0, 2], recording)
+        (draw_way if moves(recording) else draw_shapes)(axes[0, 0], recording)
+        starts_right = recording.configuration.initial == "setpoint"
+        estimation = draw_distance if starts_right else draw_estimation
+        estimation(axes[0, 1], recording, observer, model)
+        (draw_tip_by_leg if moves(recording) else draw_tip)(axes[0, 2], recording)
         draw_commands(axes[1, 0], recording)
         draw_curvature(axes[1, 1], recording)
         draw_sweeps(axes[1, 2], recording)
@@ -94,8 +99,9 @@ def title(recording: Recording) -> str:
     """One line that says which run this is."""
     run = recording.configuration
     parts = [
+        f"scenario {run.scenario!r}",
         f"{run.nodes} nodes, {recording.ticks} ticks of {run.tick_s:g} s",
-        f"setpoint {run.setpoint!r}",
+        f"setpoint {' - '.join([run.setpoint, *(leg.to for leg in run.legs)])}",
         f"initial shape {run.initial!r}",
         f"disturbance {run.disturbance.name!r}",
         f"seed {run.seed}",
@@ -134,6 +140,47 @@ def draw_shapes(ax: Any, recording: Recording) -> None:
     ax.figure.colorbar(colours, ax=ax, label="time [s]", pad=0.02)
 
 
+def moves(recording: Recording) -> bool:
+    """Whether the reference goes anywhere in this run."""
+    return bool(recording.configuration.legs)
+
+
+def runs_of(active: npt.NDArray[np.int64]) -> list[tuple[int, int, int]]:
+    """Stretches of ticks with the same setpoint's gains: (setpoint, first tick, one past the last)."""
+    edges = [0, *(np.flatnonzero(np.diff(active)) + 1).tolist(), active.size]
+    return [(int(active[a]), a, b) for a, b in pairwise(edges)]
+
+
+def draw_way(ax: Any, recording: Recording) -> None:
+    """The tip's way in the colour of the gains, the way that was asked for, the arm at the end of each leg."""
+    run, artefact = recording.configuration, recording.artefact
+    active, tips, names = active_setpoints(recording), recording.tips_m, run.setpoint_names
+    for index in visited(recording):
+        shape = setpoint_shape(artefact.setpoints[index], artefact.arm.length_m)
+        ax.plot(*shape.T, color=GREY, linewidth=0.9, linestyle=(0, (5, 2)))
+    times = recording.times_s
+    for leg in make_legs(
+        run.setpoint, run.first_hold_s, run.legs, recording.ticks * recording.tick_s
+    ):
+        k = int(np.searchsorted(times, leg.until_s - 0.5 * recording.tick_s)) - 1
+        ax.plot(*recording.shapes_m[k].T, color=colour(int(active[k])), linewidth=2.2, alpha=0.7)
+    for index, first, end in runs_of(active):
+        ax.plot(*tips[first : end + 1].T, color=colour(index), linewidth=2.2)
+    ax.plot(*reference_tips(recording).T, color="black", linewidth=1.1, linestyle=(0, (4, 2)))
+    ax.plot(0.0, 0.0, marker="s", markersize=7, color="black", clip_on=False)
+    key = [
+        Line2D([], [], color=colour(index), linewidth=2.2, label=f"gains {names[index]}")
+        for index in sorted(set(active.tolist()))
+    ]
+    key.append(
+        Line2D([], [], color="black", linewidth=1.1, linestyle=(0, (4, 2)), label="reference")
+    )
+    ax.plot(*(1.2 * artefact.arm.length_m * np.ones((2, 1))), " ")  # room for the key
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set(xlabel="x [m]", ylabel="y [m]", title="Tip's way, arm at the end of each leg")
+    ax.legend(handles=key, loc="upper right", frameon=False)
+
+
 def draw_estimation(
     ax: Any, recording: Recording, observer: EstimationErrors, model: EstimationErrors
 ) -> None:
@@ -145,12 +192,12 @@ def draw_estimation(
         ("shape", 0.8, (0, (5, 1.5)), 0.7, "white"),
         ("energy", 1.6, "-", 1.0, None),
     ):
-        for errors, colour, name in both:
+        for errors, tone, name in both:
             course: ErrorCourse = getattr(errors, norm)
             ax.semilogy(
                 times,
                 course.relative,
-                color=colour,
+                color=tone,
                 linewidth=width,
                 linestyle=dashes,
                 alpha=opacity,
@@ -161,8 +208,8 @@ def draw_estimation(
                     course.below_1_percent_s,
                     THRESHOLD,
                     "o",
-                    color=colour,
-                    markerfacecolor=fill or colour,
+                    color=tone,
+                    markerfacecolor=fill or tone,
                     markersize=6,
                     zorder=4,
                 )
@@ -185,6 +232,21 @@ def draw_estimation(
     tidy(ax, times)
 
 
+def draw_distance(
+    ax: Any, recording: Recording, observer: EstimationErrors, model: EstimationErrors
+) -> None:
+    """Distance of the estimated shape from the true one: for runs that start without an error."""
+    times = recording.times_s
+    for errors, tone, name in ((model, VERMILION, "open loop"), (observer, BLUE, "observer")):
+        ax.semilogy(times, 1e3 * errors.shape.norm, color=tone, linewidth=1.2, label=name)
+    low, high = ax.get_ylim()
+    ax.set_ylim(max(low, 1e-4 * high), 5.0 * high)  # room for the legend
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.set(xlabel="time [s]", ylabel="rms distance [mm]", title="Shape estimation error")
+    ax.legend(loc="upper right", ncols=2, frameon=False)
+    tidy(ax, times)
+
+
 def _percent(share: float, _: int | None) -> str:
     """Label of a tick; none where the legend is."""
     return f"{100.0 * share:g}%" if share < 5.0 else ""
@@ -199,6 +261,30 @@ def draw_tip(ax: Any, recording: Recording) -> None:
     tidy(ax, times)
 
 
+def draw_tip_by_leg(ax: Any, recording: Recording) -> None:
+    """Distance of the tip from the reference's, in the colour of the gains; holds are shaded."""
+    run, times = recording.configuration, recording.times_s
+    error = 1e3 * recording.tip_error_m
+    active = active_setpoints(recording)
+    for index, first, end in runs_of(active):
+        ax.semilogy(times[first : end + 1], error[first : end + 1], color=colour(index))
+    ax.axhline(1e3 * NEAR_M, color=GREY, linewidth=0.9, linestyle=":")
+    for leg in make_legs(
+        run.setpoint, run.first_hold_s, run.legs, recording.ticks * recording.tick_s
+    ):
+        if leg.hold_from_s < leg.until_s:
+            ax.axvspan(leg.hold_from_s, leg.until_s, color=GREY, alpha=0.12, linewidth=0.0)
+            middle = 0.5 * (leg.hold_from_s + leg.until_s)
+            ax.text(middle, 0.98, leg.to, transform=ax.get_xaxis_transform(), ha="center", va="top")
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    low, high = ax.get_ylim()
+    ax.set_ylim(max(low, 1e-3 * high), 2.5 * high)  # room for the names
+    ax.set(
+        xlabel="time [s]", ylabel="distance from reference [mm]", title="Tip error; holds are grey"
+    )
+    tidy(ax, times)
+
+
 def draw_commands(ax: Any, recording: Recording) -> None:
     """Commands of all segments over time."""
     faces = np.asarray(recording.configuration.faces_m)
@@ -207,11 +293,11 @@ def draw_commands(ax: Any, recording: Recording) -> None:
 
 
 def draw_curvature(ax: Any, recording: Recording) -> None:
-    """True curvature less the setpoint's, over time."""
+    """True curvature less the reference's, over time."""
     faces = np.asarray(recording.configuration.faces_m)
-    deviation = recording.truth[:, :, 3] - recording.initial_estimates[:, 3]
-    image(ax, recording, faces, deviation, "deviation [1/m]")
-    ax.set_title("Curvature less the setpoint's")
+    wanted = np.stack([recording.references.states(k)[:, 3] for k in range(recording.ticks)])
+    image(ax, recording, faces, recording.truth[:, :, 3] - wanted, "deviation [1/m]")
+    ax.set_title("Curvature less the reference's")
 
 
 def image(ax: Any, recording: Recording, faces_m: Array, values: Array, label: str) -> None:
@@ -235,8 +321,8 @@ def draw_sweeps(ax: Any, recording: Recording) -> None:
     p50, p99 = np.percentile(durations, [50.0, 99.0])
     end = 1.3 * float(p99)
     ax.hist(durations[durations <= end], bins=40, range=(0.0, end), color=BLUE, alpha=0.75)
-    for value, colour, name in ((p50, GREEN, "p50"), (p99, VERMILION, "p99")):
-        ax.axvline(value, color=colour, linewidth=1.8, label=f"{name} = {value:.2f} ms")
+    for value, tone, name in ((p50, GREEN, "p50"), (p99, VERMILION, "p99")):
+        ax.axvline(value, color=tone, linewidth=1.8, label=f"{name} = {value:.2f} ms")
     beyond = int(np.count_nonzero(durations > end))
     if beyond:
         slowest = float(durations.max())

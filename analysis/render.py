@@ -5,6 +5,7 @@ Takes the dictionary of `analysis.summary`, gives text; nothing is computed here
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from io import StringIO
 from typing import Any
 
@@ -13,22 +14,41 @@ from rich.console import Console
 from rich.table import Table
 
 WIDTH = 118
+LEG = (
+    "leg",
+    "hold",
+    "tip error, end",
+    "in the hold",
+    "in the move",
+    "below 1 cm after",
+    "shape estimate, end",
+    "gains",
+)
+SWITCH = ("gains", "tick", "tip at", "jump of the commands", "step that was made", "tick before")
 
 
 def render(summary: dict[str, Any], width: int = WIDTH) -> str:
     """The summary of `analysis.summary.summarise` as text of the given width, without colours."""
+    lines = _table(("figure", "value", "meaning"), rows(summary), width)
+    if len(summary["legs"]) > 1:
+        lines += ["", *_table(LEG, leg_rows(summary), width)]
+    if summary["switches"]:
+        lines += ["", *_table(SWITCH, switch_rows(summary), width)]
+    state = "complete" if summary["recording_complete"] else f"not complete: {_stops(summary)}"
+    return "\n".join([*lines, "", f"recording {summary['recording']} ({state})", ""])
+
+
+def _table(head: Sequence[str], body: Sequence[Sequence[str]], width: int) -> list[str]:
     table = Table(box=box.SIMPLE, pad_edge=False, show_edge=False, padding=(0, 2, 0, 0))
-    table.add_column("figure", no_wrap=True)
-    table.add_column("value", overflow="fold")
-    table.add_column("meaning", overflow="fold")
-    for row in rows(summary):
+    table.add_column(head[0], no_wrap=True)
+    for name in head[1:]:
+        table.add_column(name, overflow="fold")
+    for row in body:
         table.add_row(*row)
     out = StringIO()
     console = Console(file=out, width=width, color_system=None, markup=False, highlight=False)
     console.print(table)
-    lines = [line.rstrip() for line in out.getvalue().splitlines()]
-    state = "complete" if summary["recording_complete"] else f"not complete: {_stops(summary)}"
-    return "\n".join([*lines, "", f"recording {summary['recording']} ({state})", ""])
+    return [line.rstrip() for line in out.getvalue().splitlines()]
 
 
 def report(summary: dict[str, Any]) -> str:
@@ -48,12 +68,12 @@ def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
     """The rows of the table: (figure, value, meaning)."""
     seconds = s["ticks"] * s["tick_s"]
     short = "" if s["ticks"] == s["ticks_asked_for"] else f" of {s['ticks_asked_for']}"
-    sweep, linear = s["sweep_ms"], s["linear_model_below_1_percent_s"]
+    sweep = s["sweep_ms"]
     out = [
         (
             "run",
             f"{s['nodes']} nodes, {s['ticks']}{short} ticks of {s['tick_s']:g} s",
-            f"{seconds:g} s of the arm's time; setpoint {s['setpoint']}, seed {s['seed']}"
+            f"{seconds:g} s of the arm's time; {_story(s)}, seed {s['seed']}"
             + ("" if s["ended"] == "finished" else f"; ended: {s['ended'] or 'unknown'}"),
         ),
         (
@@ -73,6 +93,50 @@ def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
             _number(s["max_difference_to_central"], "", 2),
             f"relative; the same gains centrally; worst at {_where(s)}",
         ),
+        *_estimation(s),
+        _tip(s),
+        (
+            "command",
+            f"rms {_number(s['command_n_per_m']['rms'], 'mN/m', scale=1e3)}, "
+            f"peak {_number(s['command_n_per_m']['peak'], 'mN/m', scale=1e3)}",
+            "transverse load per length over arm and time",
+        ),
+    ]
+    out += [_gamma(s, role) for role in ("observer", "controller")]
+    out += [
+        (
+            "rejected messages",
+            _count(s["rejected_messages"]),
+            f"malformed, stale or foreign; ticks lost by the recorder: {_count(s['ticks_lost'])}",
+        ),
+        ("start-up", _number(s["start_up_s"], "s", 2), "wall clock, plan to first measurement"),
+        ("gains", s["artefact_sha256"][:16], "SHA-256 of the artefact, first 16 digits"),
+    ]
+    return out
+
+
+def _estimation(s: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """How well the arm was known: relative to the start's error where the run starts with one."""
+    if s["initial"] == "setpoint":
+        energy, shape = s["estimation_rms_root_joule"], s["shape_estimation_rms_m"]
+        largest = s["shape_estimation_largest_m"]
+        return [
+            (
+                "estimation error",
+                f"rms {_number(energy['observer'], 'J^1/2')}",
+                f"energy norm; open-loop model {_number(energy['open_loop_model'], 'J^1/2')}",
+            ),
+            (
+                "shape estimation error",
+                f"rms {_number(shape['observer'], 'mm', scale=1e3)}, "
+                f"largest {_number(largest['observer'], 'mm', scale=1e3)}",
+                "rms distance of estimated from true arm; open-loop model "
+                f"{_number(shape['open_loop_model'], 'mm', scale=1e3)}, "
+                f"{_number(largest['open_loop_model'], 'mm', scale=1e3)}",
+            ),
+        ]
+    linear = s["linear_model_below_1_percent_s"]
+    return [
         (
             "estimation error",
             _course(s["estimation_error"], "%", 100.0),
@@ -93,36 +157,74 @@ def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
             "below 1 %, energy norm, without noise and disturbance; open-loop model "
             f"{_time(linear['open_loop_model'], none='not within an hour')}",
         ),
-        (
-            "tip error",
-            _course(s["tip_error_m"], "mm", 1e3),
-            f"distance from the setpoint's; under 5 % of the first: {_time(s['tip_settling_s'])}",
-        ),
-        (
-            "command",
-            f"rms {_number(s['command_n_per_m']['rms'], 'mN/m', scale=1e3)}, "
-            f"peak {_number(s['command_n_per_m']['peak'], 'mN/m', scale=1e3)}",
-            "transverse load per length over arm and time",
-        ),
     ]
-    out += [
+
+
+def _tip(s: dict[str, Any]) -> tuple[str, str, str]:
+    if len(s["legs"]) > 1 or s["initial"] == "setpoint":
+        rms, largest = (_number(s[f"tip_error_{k}_m"], "mm", scale=1e3) for k in ("rms", "largest"))
+        return "tip error", f"rms {rms}, largest {largest}", "distance from the reference's"
+    return (
+        "tip error",
+        _course(s["tip_error_m"], "mm", 1e3),
+        f"distance from the setpoint's; under 5 % of the first: {_time(s['tip_settling_s'])}",
+    )
+
+
+def _gamma(s: dict[str, Any], role: str) -> tuple[str, str, str]:
+    several = s["gamma_of_setpoints"]
+    if len(several) == 1:
+        (one,) = several.values()
+        value = f"{one[role]['achieved']:.4g} achieved, {one[role]['certified']:.4g} certified"
+        return f"gamma, {role}", value, "H-infinity norm of the design, and its proven bound"
+    achieved, certified = (
+        ", ".join(f"{one[role][kind]:.4f}" for one in several.values())
+        for kind in ("achieved", "certified")
+    )
+    return f"gamma, {role}", achieved, f"at setpoints {', '.join(several)}; proven: {certified}"
+
+
+def leg_rows(s: dict[str, Any]) -> list[tuple[str, ...]]:
+    """The rows of the table of legs, columns `LEG`."""
+    return [
         (
-            f"gamma, {role}",
-            f"{_number(g['achieved'], '', 4)} achieved, {_number(g['certified'], '', 4)} certified",
-            "H-infinity norm of the design, and its proven bound",
+            leg["way"],
+            _hold(leg),
+            _number(leg["tip_error_end_m"], "mm", scale=1e3),
+            _number(leg["tip_error_largest_in_hold_m"], "mm", scale=1e3, none="-"),
+            _number(leg["tip_error_largest_in_move_m"], "mm", scale=1e3, none="-"),
+            _time(leg["tip_below_1_cm_after_s"], none="not in the hold" if held(leg) else "-"),
+            _number(leg["shape_estimation_error_end_m"], "mm", scale=1e3),
+            leg["gains_at_end"] or "unknown",
         )
-        for role, g in s["gamma"].items()
+        for leg in s["legs"]
     ]
-    out += [
+
+
+def held(leg: dict[str, Any]) -> bool:
+    """Whether the run got to a hold of this leg."""
+    return bool(leg["hold_from_s"] < leg["until_s"])
+
+
+def _hold(leg: dict[str, Any]) -> str:
+    if held(leg):
+        return f"{leg['hold_from_s']:g} to {leg['until_s']:g} s"
+    return "none" if leg["until_s"] == leg["hold_from_s"] else "not reached"
+
+
+def switch_rows(s: dict[str, Any]) -> list[tuple[str, ...]]:
+    """The rows of the table of changes of gains, columns `SWITCH`."""
+    return [
         (
-            "rejected messages",
-            _count(s["rejected_messages"]),
-            f"malformed, stale or foreign; ticks lost by the recorder: {_count(s['ticks_lost'])}",
-        ),
-        ("start-up", _number(s["start_up_s"], "s", 2), "wall clock, plan to first measurement"),
-        ("gains", s["artefact_sha256"][:16], "SHA-256 of the artefact, first 16 digits"),
+            f"{one['from']} -> {one['to']}",
+            f"{one['tick']} ({one['time_s']:g} s)",
+            f"{one['tip_angle_deg']:.1f} degrees",
+            f"{_number(one['command_jump_n_per_m'], 'mN/m', scale=1e3)}, faded out",
+            _number(one["command_step_n_per_m"], "mN/m", scale=1e3),
+            _number(one["command_step_before_n_per_m"], "mN/m", scale=1e3),
+        )
+        for one in s["switches"]
     ]
-    return out
 
 
 def _below_1_percent(s: dict[str, Any], norm: str) -> tuple[str, str, str]:
@@ -145,6 +247,11 @@ def _stops(s: dict[str, Any]) -> str:
     return s["recording_stops"] or "it has no final counters"
 
 
+def _story(s: dict[str, Any]) -> str:
+    by = f"setpoint {s['setpoint']}" if len(s["legs"]) <= 1 else f"scenario {s['scenario']}"
+    return by if s["control"] else f"{by}, no feedback"
+
+
 def _where(s: dict[str, Any]) -> str:
     d = s["difference_to_central"]
     return f"tick {d['tick']}, node {d['node']}"
@@ -154,9 +261,11 @@ def _count(value: float | None) -> str:
     return "unknown" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _number(value: float | None, unit: str, digits: int = 3, scale: float = 1.0) -> str:
+def _number(
+    value: float | None, unit: str, digits: int = 3, scale: float = 1.0, none: str = "unknown"
+) -> str:
     if value is None:
-        return "unknown"
+        return none
     return f"{value * scale:.{digits}g} {unit}".rstrip()
 
 

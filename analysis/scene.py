@@ -18,7 +18,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Wedge
 
-from analysis.goals import active_setpoints, colour, reference_tips, sectors, setpoint_shape
+from analysis.goals import (
+    active_setpoints,
+    colour,
+    reference_tips,
+    sectors,
+    setpoint_shape,
+    visited,
+)
 from analysis.recording import Recording
 from analysis.shape_error import arm_curves
 
@@ -66,6 +73,8 @@ class Scene:
         self._names = [setpoint.name for setpoint in artefact.setpoints]
         self._setpoints = artefact.setpoints
         self._length = artefact.arm.length_m
+        self._sectors = sectors(recording)
+        self._visited = visited(recording)
         with mpl.rc_context(STYLE):
             self._build(width_px, note)
 
@@ -130,12 +139,12 @@ class Scene:
 
     def _limits(self) -> tuple[Array, Array]:
         """Corners of what is shown, (2,) each, in m."""
-        goals = [setpoint_shape(s, self._length) for s in self._setpoints]
+        goals = [setpoint_shape(self._setpoints[i], self._length) for i in self._visited]
         points = np.concatenate([*goals, self._shapes.reshape(-1, 2), self._path, np.zeros((1, 2))])
         points = points[np.isfinite(points).all(axis=1)]
         free = MARGIN * self._length
         low, high = points.min(axis=0) - free, points.max(axis=0) + free
-        for index in sectors(self._setpoints):
+        for index in self._sectors:
             x, y = self._name_place(index)
             wide = LETTER * self._length * len(self._setpoints[index].name)
             high = np.maximum(high, (x + wide, y + LETTER * self._length))
@@ -155,19 +164,18 @@ class Scene:
         return reach * tip[0], reach * tip[1]
 
     def _radius(self) -> float:
-        return SECTOR * max(math.hypot(*s.tip_m) for s in self._setpoints)
+        return SECTOR * max(math.hypot(*self._setpoints[i].tip_m) for i in self._visited)
 
     def _draw_setpoints(self, ax: Any) -> dict[int, Wedge]:
         """Sectors, shapes and names of the setpoints; gives the sector to show where it is active."""
         wedges = {}
-        used = {int(i) for i in self._active} | set(sectors(self._setpoints))
-        for index in sorted(used):
+        for index in self._visited:
             setpoint, tone = self._setpoints[index], colour(index)
             shape = setpoint_shape(setpoint, self._length, 65)
             ax.plot(*shape.T, color=tone, linewidth=1.0, alpha=0.55, linestyle=(0, (5, 2)))
-            if index not in sectors(self._setpoints):
+            if index not in self._sectors:
                 continue
-            low, high = sectors(self._setpoints)[index]
+            low, high = self._sectors[index]
             radius, degrees = self._radius(), (math.degrees(low), math.degrees(high))
             ax.add_patch(
                 Wedge((0, 0), radius, *degrees, facecolor=tone, alpha=0.06, edgecolor="none")

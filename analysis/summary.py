@@ -8,12 +8,15 @@ figure that the recording does not hold (a run cut short has no counters) is nul
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from analysis.central import CentralComparison, compare_with_central
+from analysis.goals import active_setpoints, visited
+from analysis.legs import leg_facts, make_legs, switch_facts
 from analysis.linear import LinearDecay, linear_decay
 from analysis.metrics import control_effort, time_below
 from analysis.open_loop import ErrorCourse, compare_with_open_loop
@@ -53,7 +56,13 @@ def summary_of(recording: Recording) -> dict[str, Any]:
     durations = recording.sweep_durations_ms[np.isfinite(recording.sweep_durations_ms)]
     tip = recording.tip_error_m
     effort = control_effort(recording.commands, np.asarray(run.faces_m), run.tick_s)
-    setpoint = recording.artefact.setpoints[run.setpoint_index]
+    gammas = {
+        setpoint.name: {
+            "observer": _gamma(setpoint.observer_certificate),
+            "controller": _gamma(setpoint.controller_certificate),
+        }
+        for setpoint in (recording.artefact.setpoints[index] for index in visited(recording))
+    }
     mean_rates = recording.of_plant(
         "regulated", ("mean_velocity_y_m_per_s", "mean_curvature_per_m")
     )
@@ -63,7 +72,10 @@ def summary_of(recording: Recording) -> dict[str, Any]:
         "ticks": recording.ticks,
         "ticks_asked_for": run.ticks,
         "tick_s": run.tick_s,
+        "scenario": run.scenario,
+        "control": run.control,
         "setpoint": run.setpoint,
+        "initial": run.initial,
         "seed": run.seed,
         **_traffic(recording),
         "sweep_ms": _percentiles(durations),
@@ -72,6 +84,7 @@ def summary_of(recording: Recording) -> dict[str, Any]:
         "difference_to_central": _central(central),
         "estimation_error": _ends(observer.energy.relative),
         "estimation_error_root_joule": _ends(observer.energy.norm),
+        "estimation_rms_root_joule": _both(_rms, observer.energy, model.energy),
         "open_loop_model_error": _ends(model.energy.relative),
         **_below_1_percent("estimation", observer.energy, model.energy),
         "estimation_decay_per_s": {
@@ -80,6 +93,8 @@ def summary_of(recording: Recording) -> dict[str, Any]:
         },
         "shape_estimation_error": _ends(observer.shape.relative),
         "shape_estimation_error_m": _ends(observer.shape.norm),
+        "shape_estimation_rms_m": _both(_rms, observer.shape, model.shape),
+        "shape_estimation_largest_m": _both(_largest, observer.shape, model.shape),
         "open_loop_model_shape_error": _ends(model.shape.relative),
         **_below_1_percent("shape", observer.shape, model.shape),
         "linear_model_below_1_percent_s": {
@@ -87,17 +102,18 @@ def summary_of(recording: Recording) -> dict[str, Any]:
             "open_loop_model": linear.open_loop_model_s,
         },
         "tip_error_m": _ends(tip),
+        "tip_error_rms_m": _rms(tip),
+        "tip_error_largest_m": _largest(tip),
         "tip_settling_s": time_below(recording.times_s, tip, SETTLED * float(tip[0])),
+        **_legs(recording, observer.shape.norm),
         "regulated_rms": {
             "mean_velocity_y_m_per_s": _rms(mean_rates[:, 0]),
             "mean_curvature_per_m": _rms(mean_rates[:, 1]),
         },
         "command_n_per_m": {"rms": effort.rms_n_per_m, "peak": effort.peak_n_per_m},
         "control_effort_n2_s_per_m": effort.integral_n2_s_per_m,
-        "gamma": {
-            "observer": _gamma(setpoint.observer_certificate),
-            "controller": _gamma(setpoint.controller_certificate),
-        },
+        "gamma": gammas[run.setpoint],
+        "gamma_of_setpoints": gammas,
         "artefact_sha256": run.artefact_sha256,
         "ended": recording.ending(),
         "recording": str(recording.path),
@@ -111,6 +127,8 @@ def _finite(value: Any) -> Any:
     """The same with null for what is not finite: JSON has no other word for it."""
     if isinstance(value, dict):
         return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_finite(inner) for inner in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
@@ -139,6 +157,27 @@ def _traffic(recording: Recording) -> dict[str, Any]:
         "intact_links": recording.intact_links(),
         "rejected_messages": recording.counter("rejected_messages"),
         "ticks_lost": recording.counter("ticks_lost"),
+    }
+
+
+def _legs(recording: Recording, shape_error_m: Any) -> dict[str, Any]:
+    """What happened leg by leg, and at every change of gains."""
+    run = recording.configuration
+    active = active_setpoints(recording)
+    names = [run.setpoint_names[index] for index in active]
+    end_s = recording.ticks * run.tick_s
+    times, tip = recording.times_s, recording.tip_error_m
+    legs = make_legs(run.setpoint, run.first_hold_s, run.legs, end_s)
+    return {
+        "legs": [leg_facts(leg, times, tip, shape_error_m, names) for leg in legs],
+        "switches": switch_facts(
+            active,
+            run.setpoint_names,
+            run.tick_s,
+            recording.tips_m,
+            recording.commands,
+            recording.bumps,
+        ),
     }
 
 
@@ -191,6 +230,17 @@ def _below_1_percent(norm: str, observer: ErrorCourse, model: ErrorCourse) -> di
 
 def _ends(values: Any) -> dict[str, float | None]:
     return {"initial": float(values[0]), "final": float(values[-1])}
+
+
+def _largest(values: Any) -> float:
+    return float(np.nanmax(values))
+
+
+def _both(
+    figure: Callable[[Any], float], observer: ErrorCourse, model: ErrorCourse
+) -> dict[str, float]:
+    """One figure of both errors' own values, not relative to the first."""
+    return {"observer": figure(observer.norm), "open_loop_model": figure(model.norm)}
 
 
 def _rms(values: Any) -> float:
