@@ -37,6 +37,7 @@ def observer_problem(
         C1=functional("v_y", "k"),
         C2=selection(*measured),
         rho=noise,
+        rates=pie.strain_rates if pie.retardation > 0.0 else None,
     )
 
 
@@ -53,6 +54,7 @@ def controller_problem(pie: ArmPIE, effort: float, actuator: str = ACTUATORS[0])
         C1=functional("v_y"),
         C2=pie.command(actuator),
         rho=effort,
+        rates=pie.strain_rates if pie.retardation > 0.0 else None,
     )
 
 

@@ -43,7 +43,8 @@ class HinfProblem:
     """One problem in observer form; the operators act on n functions of the primary state x.
 
     T, A: f -> x and f -> x_t; krylov: x -> A^-1 x; B: R^w -> x; C1: x -> R^z; C2: x -> outputs;
-    rho: weight of the noise on the fed-back output.
+    rho: weight of the noise on the fed-back output; rates: functions of f that the dynamics dissipate
+    and that are no functions of x (Kelvin-Voigt damping), None if there are none.
     """
 
     T: PIOperator
@@ -53,6 +54,7 @@ class HinfProblem:
     C1: PIOperator
     C2: PIOperator
     rho: float
+    rates: PIOperator | None = None
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,7 @@ class _Signals:
         eye = PIOperator.identity(Shape(nz + nw, n + ny))
         f = eye.rows([], range(n))
         w = eye.rows(range(nz, nz + nw), [])
+        self.rates = None if problem.rates is None else problem.rates @ f
         self.noise = eye.rows([], range(n, n + ny))
         self.z = lifted(eye.rows(range(nz), []))
         self.w = lifted(w)
@@ -130,6 +133,7 @@ class _Rows:
             *(weighted(signals.w, profile) for profile in function_span(columns)),
             lifted(integrals @ signals.x),
             self.gain @ signals.x,
+            *(() if signals.rates is None else (signals.rates,)),
             signals.noise,
         )
 
