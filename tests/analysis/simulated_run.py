@@ -11,13 +11,16 @@ import json
 import math
 import shutil
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from closed_form import artefact
 
-from deploy import Deployment, deploy
+from deploy import Deployment, SegmentGrid, deploy
+from deploy.path import make_references
+from node.scheduling import Sectors
 from node.sweep import NodeSweep
 from plant.disturbance import DisturbanceSpec
 from plant.initial import initial_shape
@@ -27,7 +30,14 @@ from recorder.writer import RecordingWriter
 from wire.artefact import GainsArtefact, write_artefact
 from wire.channels import FORMAT_VERSION, SHAPE_POINTS, label, node_channels, plant_channels
 from wire.messages import PLANT
-from wire.run_config import DisturbanceConfig, NoiseConfig, RunConfig, dumps
+from wire.run_config import (
+    DisturbanceConfig,
+    LegConfig,
+    NoiseConfig,
+    RunConfig,
+    SchedulingConfig,
+    dumps,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -54,12 +64,34 @@ class Scenario:
     noise: tuple[float, float] = (1e-5, 1e-4)
     """Standard deviations of v_y in m/s and of the curvature in 1/m."""
     spacing: str = "equispaced"
+    first_hold_s: float = 0.0
+    legs: tuple[LegConfig, ...] = ()
+    bump_s: float = 2.0
 
 
-def run_config(scenario: Scenario, deployment: Deployment, sha256: str) -> RunConfig:
+def scheduling(artefact: GainsArtefact, scenario: Scenario) -> SchedulingConfig:
+    """Sectors of the setpoints that are visited, in the order of their tips' angles, boundaries midway."""
+    names = {scenario.setpoint, *(n for leg in scenario.legs for n in (*leg.through, leg.to))}
+    angles = sorted(
+        (math.degrees(math.atan2(one.tip_m[1], one.tip_m[0])), index)
+        for index, one in enumerate(artefact.setpoints)
+        if one.name in names
+    )
+    return SchedulingConfig(
+        setpoints=tuple(index for _, index in angles),
+        boundaries_deg=tuple(0.5 * (a + b) for (a, _), (b, _) in pairwise(angles)),
+        hysteresis_deg=1.0,
+        bump_s=scenario.bump_s,
+    )
+
+
+def run_config(
+    scenario: Scenario, artefact: GainsArtefact, deployment: Deployment, sha256: str
+) -> RunConfig:
     index = deployment.setpoint_names.index(scenario.setpoint)
     return RunConfig(
         run_id="simulated",
+        scenario="simulated",
         nodes=scenario.nodes,
         spacing=scenario.spacing,
         faces_m=tuple(deployment.faces_m.tolist()),
@@ -68,6 +100,10 @@ def run_config(scenario: Scenario, deployment: Deployment, sha256: str) -> RunCo
         seed=scenario.seed,
         setpoint=scenario.setpoint,
         setpoint_names=deployment.setpoint_names,
+        first_hold_s=scenario.first_hold_s,
+        legs=scenario.legs,
+        scheduling=scheduling(artefact, scenario),
+        control=True,
         initial=scenario.initial,
         disturbance=DisturbanceConfig(scenario.disturbance, 1.0),
         noise=NoiseConfig(*scenario.noise),
@@ -98,12 +134,11 @@ def write_recording(
     attached = path.with_suffix(".gains.json")
     sha256 = write_artefact(artefact, attached)
     deployment = deploy(artefact, scenario.nodes, scenario.tick_s, scenario.spacing)
-    run = run_config(scenario, deployment, sha256)
+    run = run_config(scenario, artefact, deployment, sha256)
     n, index = run.nodes, run.setpoint_index
-    factors = [node.setpoints[index] for node in deployment.nodes]
     layout = {
-        i: node_channels(i, n, factors[i].forward_received, factors[i].backward_received)
-        for i in range(n)
+        i: node_channels(i, n, node.forward_received, node.backward_received)
+        for i, node in enumerate(deployment.nodes)
     }
     layout[PLANT] = plant_channels(n)
     growing = path.with_suffix(".growing")
@@ -131,18 +166,36 @@ def write_recording(
         )
     )
     noise = SensorNoise(run.seed, run.noise.velocity_y_m_per_s, run.noise.curvature_per_m)
-    sweeps = [NodeSweep(node, index) for node in deployment.nodes]
+    references = make_references(
+        artefact,
+        SegmentGrid(deployment.faces_m),
+        run.tick_s,
+        run.setpoint,
+        run.first_hold_s,
+        run.legs,
+    )
+    sweeps = [
+        NodeSweep(
+            node,
+            index,
+            reference=references.nodes[i],
+            sectors=Sectors.of(run.scheduling),
+            fade=math.exp(-run.tick_s / run.scheduling.bump_s),
+        )
+        for i, node in enumerate(deployment.nodes)
+    ]
     wall = np.random.default_rng(run.seed)
-    equilibrium = deployment.dense[index].out_offset.reshape(n, 5)
     for k in range(run.ticks):
         measured = plant.measure() + noise.sample(k, n)
         rows = node_rows(sweeps, measured, wall)
         tip, truth = plant.tip(), plant.truth()
-        mean = np.diff(run.faces_m) @ (truth - equilibrium[:, :4])
+        mean = np.diff(run.faces_m) @ (truth - references.states(k)[:, :4])
+        wanted = references.plant.at(k)[:2]
         rows[PLANT] = [
             *truth.ravel().tolist(),
             *tip.tolist(),
-            float(np.hypot(*(tip - setpoint.tip_m))),
+            float(np.hypot(*(tip - wanted))),
+            *wanted.tolist(),
             *plant.energy(),
             float(mean[1]),
             float(mean[3]),
@@ -170,7 +223,7 @@ def node_rows(
     """One tick of all nodes; their telemetry rows, and their states advanced."""
     n = len(sweeps)
     inputs = [sweep.input(y).copy() for sweep, y in zip(sweeps, measured, strict=True)]
-    forward = [np.zeros(0)]
+    forward = [np.zeros(sweeps[0].forward_received)]
     for i in range(n - 1):
         forward.append(sweeps[i].forward(inputs[i], forward[i]).copy())
     backward = [np.zeros(0)]
@@ -183,6 +236,8 @@ def node_rows(
             *measured[i].tolist(),
             *sweep.estimate.tolist(),
             sweep.command,
+            float(sweep.setpoint),
+            sweep.bump,
             *forward[i].tolist(),
             *backward[i].tolist(),
             *wall.integers(0, 10**6, instants).astype(float).tolist(),
