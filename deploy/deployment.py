@@ -213,7 +213,8 @@ def _difference(realisation: Sequence[NodeMatrices], scaled: Array) -> float:
 def _offsets(arm: Arm, setpoint: Setpoint, grid: SegmentGrid) -> tuple[Array, Array]:
     """The setpoint as n commands hold it, as inputs (n, 7) and outputs (n, 5): x_e, feed-forward, y_e."""
     series = np.asarray(setpoint.curvature_per_m, dtype=np.float64)
-    held = Holder(arm, grid).hold(series, equilibrium(arm, series, f"setpoint {setpoint.name!r}"))
+    what = f"setpoint {setpoint.name}"
+    held = Holder(arm, grid).hold(series, equilibrium(arm, series, what), what)
     in_offset = np.zeros((grid.nodes, INPUTS))
     in_offset[:, 2] = held.strain
     in_offset[:, 3] = held.curvature_per_m

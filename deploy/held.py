@@ -28,7 +28,7 @@ from deploy.feedforward import holding, profiles, projection
 from deploy.grid import Place, SegmentGrid
 from deploy.model import tangent_angle
 from wire.artefact import Arm
-from wire.errors import OctarmError
+from wire.errors import UsageError
 
 Array = npt.NDArray[np.float64]
 
@@ -72,16 +72,25 @@ class Holder:
         self._statics = _Statics(arm, grid) if arm.actuator == "transverse" else None
         self._projection = projection(grid, SIZE)
 
-    def hold(self, curvature_per_m: Array, rest: Equilibrium, near: Held | None = None) -> Held:
+    def hold(
+        self, curvature_per_m: Array, rest: Equilibrium, what: str, near: Held | None = None
+    ) -> Held:
         """Commands whose shape is as near as possible to this one, and the shape that they hold.
 
-        curvature_per_m (Legendre series) and its equilibrium; `near`: a similar shape, to start from. Loads
-        along the normal are chosen by their moment, to first order (`deploy.feedforward.holding`). Raises
-        OctarmError if no shape is found.
+        curvature_per_m (Legendre series) and its equilibrium; `what`: its name in messages; `near`: a similar
+        shape, to start from. Loads along the normal are chosen by their moment, to first order
+        (`deploy.feedforward.holding`). Raises UsageError if no shape is found.
         """
         grid = self._grid
         if self._statics is not None:
-            return self._statics.hold(curvature_per_m, self.commands(rest.load_n_per_m), near)
+            first = self.commands(rest.load_n_per_m)
+            held = self._statics.hold(curvature_per_m, first, near)
+            if held is None:
+                raise UsageError(
+                    f"{what}: {grid.nodes} segments hold no shape like it; use more nodes, or a curvature "
+                    "that vanishes at the tip together with its slope"
+                )
+            return held
         found = holding(self._arm, curvature_per_m, rest.strain, rest.load_n_per_m, grid)
         outer, centre, inner = (
             2.0 * grid.locations_m(place) / grid.length_m - 1.0
@@ -137,11 +146,11 @@ class _Statics:
         self._force = beyond[1::2]  # (CELLS, n): N_y at the cells' centres per command
         self._ends = np.arange(CELLS + 1) * self._step
 
-    def hold(self, curvature_per_m: Array, first_n_per_m: Array, near: Held | None) -> Held:
-        """Commands whose shape has nearly this curvature (Legendre series), and that shape.
+    def hold(self, curvature_per_m: Array, first_n_per_m: Array, near: Held | None) -> Held | None:
+        """Commands whose shape has nearly this curvature (Legendre series), and that shape; None if not found.
 
         first_n_per_m: commands to start from, which matter only where they hardly turn the arm; near: a similar
-        shape, to start from it instead. Raises OctarmError if no shape is found.
+        shape, to start from it instead.
         """
         wanted = tangent_angle(curvature_per_m, self.centres_m, self._arm.length_m)
         command, start = first_n_per_m, wanted
@@ -149,7 +158,7 @@ class _Statics:
             command, start = first_n_per_m + near.misfit_n_per_m, near.angle_rad
         shape = self._shape(command, start)
         if shape is None:
-            raise OctarmError("no shape of the arm balances the load of the segments on the way")
+            return None
         for _ in range(GAUSS_NEWTON):
             turns = shape.turns(self._force)
             weight = WEAKEST * np.linalg.norm(turns, 2) * np.eye(len(command))

@@ -171,14 +171,15 @@ def _sample(
     sigma: Array,
     names: Sequence[str],
 ) -> _Samples:
-    what = " -> ".join(names)
+    what = f"setpoint {' -> '.join(names)}"
     wanted: list[tuple[Array, Equilibrium]] = []
     held: list[Held] = []
     for one in sigma:
         series = path(float(one))
-        rest = equilibrium(arm, series, f"{what} at {one:.2f} of the way")
+        name = what if len(names) == 1 else f"{what} at {one:.2f} of the way"
+        rest = equilibrium(arm, series, name)
         wanted.append((series, rest))
-        held.append(holder.hold(series, rest, held[-1] if held else None))
+        held.append(holder.hold(series, rest, name, held[-1] if held else None))
     waves_outer, waves_inner, waves_tip = (
         legendre.legvander(2.0 * places / grid.length_m - 1.0, SIZE - 1)
         for places in (grid.faces_m[1:], grid.faces_m[:-1], grid.faces_m[-1:])

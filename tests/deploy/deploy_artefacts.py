@@ -24,7 +24,8 @@ ARM = Arm(
     density_kg_per_m3=1050.0,
     drag_per_s=0.02,
 )
-CURVED = [0.9, -1.3, 0.5, 0.1, -0.2]
+# (1 - s)^2 (1.6 - 1.1 s + 0.9 s^2) with s = arclength / length: no moment and no shear at the tip, 33.8 degrees
+CURVED = [0.4716666666666667, -0.745, 0.31547619047619047, -0.055, 0.012857142857142857]
 STRAIGHT = [0.0]
 
 

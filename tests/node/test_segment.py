@@ -33,8 +33,10 @@ def factors(index: int, nodes: int, seed: int = 0) -> NodeFactors:
         "in_offset": (7,),
         "out_offset": (5,),
     }
-    one = SweepFactors(**{k: 3.0 * rng.normal(size=shape) for k, shape in shapes.items()})
-    return NodeFactors(index, rng.normal(size=(1, 4)), rng.normal(size=1), (one,))
+    made = {k: 3.0 * rng.normal(size=shape) for k, shape in shapes.items()}
+    made["in_offset"] = np.concatenate([made["out_offset"], made["out_offset"][[1, 3]]])
+    start = rng.normal(size=(1, 4)), rng.normal(size=1)
+    return NodeFactors(index, nodes, np.array([0.1, 0.1]), *start, (SweepFactors(**made),))
 
 
 class Bench:
@@ -47,9 +49,9 @@ class Bench:
         self.segment = Segment(
             NodeSweep(self.factors),
             nodes,
-            send_forward=lambda k, v: self.sent.append(("forward", k, v)),
-            send_backward=lambda k, v: self.sent.append(("backward", k, v)),
-            send_command=lambda k, v: self.sent.append(("command", k, v)),
+            send_forward=lambda k, _, v: self.sent.append(("forward", k, v)),
+            send_backward=lambda k, _, v: self.sent.append(("backward", k, v)),
+            send_command=lambda k, _, v: self.sent.append(("command", k, v)),
             record=lambda _, row: self.rows.append(row),
         )
 
@@ -63,9 +65,9 @@ def inputs(index: int, nodes: int, tick: int) -> dict[str, list[float]]:
     y, c, d = rng.normal(size=2), rng.normal(size=3), rng.normal(size=2)
     out = {"measurement": y.tolist()}
     if index > 0:
-        out["forward"] = c.tolist()
+        out["forward"] = [*c.tolist(), 0.1, 0.5, 0.2]
     if index < nodes - 1:
-        out["backward"] = d.tolist()
+        out["backward"] = [*d.tolist(), 0.0]
     return out
 
 
@@ -96,20 +98,24 @@ def test_numbers_are_those_of_the_equations() -> None:
     f = bench.factors.setpoints[0]
     held = [*bench.factors.initial_estimate[0], *bench.factors.initial_command]
     x = np.array([*held, *now["measurement"]]) - f.in_offset
-    c, d = np.array(now["forward"]), np.array(now["backward"])
+    c, d = np.array(now["forward"][:3]), np.array(now["backward"][:2])
     for what in ("backward", "forward", "measurement"):
         bench.give(what, 0, now[what])
     sent = {kind: values for kind, _, values in bench.sent}
     out = f.D @ x + f.P @ c + f.U @ d + f.out_offset
-    np.testing.assert_allclose(sent["forward"], f.W @ c + f.Q @ x, rtol=1e-13)
-    np.testing.assert_allclose(sent["backward"], f.V @ d + f.R @ x, rtol=1e-13)
+    np.testing.assert_allclose(sent["forward"][:3], f.W @ c + f.Q @ x, rtol=1e-13)
+    np.testing.assert_allclose(sent["backward"], [*(f.V @ d + f.R @ x), 0.0], rtol=1e-13)
+    angle, length = 0.1 + 0.1 * held[3], 0.1 * (1.0 + held[2])
+    end = [angle, 0.5 + length * np.cos(angle), 0.2 + length * np.sin(angle)]
+    np.testing.assert_allclose(sent["forward"][3:], end, rtol=1e-13)
     np.testing.assert_allclose(sent["command"], out[4:], rtol=1e-13)
     row = bench.rows[0]
     assert row[:2] == now["measurement"]
     assert row[2:7] == held
-    assert row[7:12] == [*now["forward"], *now["backward"]]
-    assert row[12:15] == [5, 5, 5]
-    assert len(row) == 16
+    assert row[7:9] == [0.0, 0.0]
+    assert row[9:18] == [*now["forward"], *now["backward"]]
+    assert row[18:21] == [5, 5, 5]
+    assert len(row) == 22
     # The next tick starts from this output.
     for what in ("measurement", "forward", "backward"):
         bench.give(what, 1, now[what])
@@ -162,6 +168,15 @@ def test_another_setpoint_is_refused() -> None:
     assert bench.segment.began_ns == 0
 
 
+@pytest.mark.parametrize("announced", [1.0, -1.0, 0.5, 1e300])
+def test_an_announced_setpoint_that_does_not_exist_is_refused(announced: float) -> None:
+    bench = Bench(1, 3)
+    with pytest.raises(RejectedError) as caught:
+        bench.give("backward", 0, [0.0, 0.0, announced])
+    assert caught.value.reason is Reason.SETPOINT
+    bench.give("backward", 0, [0.0, 0.0, 0.0])
+
+
 def test_ends_have_no_neighbour_to_wait_for() -> None:
     first, last = Bench(0, 2), Bench(1, 2)
     assert first.segment.missing() == ["measurement from the plant", "backward sum from node 1"]
@@ -180,5 +195,5 @@ def test_overflow_is_named_by_tick_node_and_field() -> None:
         np.errstate(all="ignore"),
         pytest.raises(NotFiniteError, match=r"tick 0: node 1 computed forward sum\[0\] = inf"),
     ):
-        bench.give("forward", 0, (1e308 * np.sign(signs)).tolist())
+        bench.give("forward", 0, [*(1e308 * np.sign(signs)).tolist(), 0.0, 0.0, 0.0])
     assert all(np.isfinite(values).all() for _, _, values in bench.sent)

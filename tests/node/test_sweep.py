@@ -3,9 +3,15 @@
 import numpy as np
 import pytest
 
-from node.sweep import NodeSweep
+from node.scheduling import Sectors
+from node.sweep import NodeSweep, Numbers
 from wire.errors import OctarmError, UsageError
 from wire.factors import INPUTS, OUTPUTS, NodeFactors, SweepFactors
+from wire.reference import Leg, Reference
+
+LENGTHS = (0.1, 0.07)
+SO_FAR = [0.3, 0.2, -0.1]
+"""Angle and place that come with a forward sum."""
 
 
 def random_factors(seed: int, c: int, c_next: int, d: int, d_previous: int) -> SweepFactors:
@@ -21,20 +27,25 @@ def random_factors(seed: int, c: int, c_next: int, d: int, d_previous: int) -> S
         "in_offset": (INPUTS,),
         "out_offset": (OUTPUTS,),
     }
-    return SweepFactors(**{key: random.standard_normal(shape) for key, shape in shapes.items()})
+    made = {key: random.standard_normal(shape) for key, shape in shapes.items()}
+    made["in_offset"] = np.concatenate([made["out_offset"], made["out_offset"][[1, 3]]])
+    return SweepFactors(**made)
 
 
 def random_node(seed: int, sizes: list[tuple[int, int, int, int]]) -> NodeFactors:
+    """Node 3 of 5; the root if its forward sum is empty, the tip if its backward sum is."""
     random = np.random.default_rng(seed + 1000)
     return NodeFactors(
-        index=3,
+        index=0 if sizes[0][0] == 0 else 3,
+        nodes=4 if sizes[0][2] == 0 else 5,
+        lengths_m=np.array(LENGTHS),
         initial_estimate=random.standard_normal((len(sizes), 4)),
         initial_command=random.standard_normal(len(sizes)),
         setpoints=tuple(random_factors(seed + i, *size) for i, size in enumerate(sizes)),
     )
 
 
-@pytest.mark.parametrize("sizes", [(3, 4, 2, 5), (0, 3, 3, 0), (2, 0, 0, 4), (0, 0, 0, 0)])
+@pytest.mark.parametrize("sizes", [(3, 4, 2, 5), (0, 3, 3, 0), (2, 0, 0, 4)])
 @pytest.mark.parametrize("as_list", [False, True])
 def test_products_are_those_of_the_matrices(
     sizes: tuple[int, int, int, int], as_list: bool
@@ -51,12 +62,17 @@ def test_products_are_those_of_the_matrices(
         z = expected_in - f.in_offset
         x = sweep.input(y.tolist() if as_list else y)
         np.testing.assert_array_equal(x, expected_in)
-        c_sent, d_sent = (c.tolist(), d.tolist()) if as_list else (c, d)
+        c_sent: Numbers = np.append(c, SO_FAR) if sizes[0] else c
+        d_sent: Numbers = np.append(d, 0.0) if sizes[2] else d
+        if as_list:
+            c_sent, d_sent = list(c_sent), list(d_sent)
+        sums = f.V @ d + f.R @ z
         np.testing.assert_allclose(
-            sweep.backward(x, d_sent), f.V @ d + f.R @ z, rtol=1e-13, atol=1e-13
+            sweep.backward(x, d_sent)[: len(sums)], sums, rtol=1e-13, atol=1e-13
         )
+        sums = f.W @ c + f.Q @ z
         np.testing.assert_allclose(
-            sweep.forward(x, c_sent), f.W @ c + f.Q @ z, rtol=1e-13, atol=1e-13
+            sweep.forward(x, c_sent)[: len(sums)], sums, rtol=1e-13, atol=1e-13
         )
         out = sweep.output(x, c_sent, d_sent)
         np.testing.assert_allclose(
@@ -73,25 +89,26 @@ def test_products_use_their_own_arguments_only() -> None:
     f = node.setpoints[0]
     sweep = NodeSweep(node)
     x = sweep.input([0.3, -0.2]).copy()
-    sweep.forward(2.0 * x, [5.0, 6.0])
-    sweep.backward(3.0 * x, [7.0, 8.0, 9.0])
+    sweep.forward(2.0 * x, [5.0, 6.0, *SO_FAR])
+    sweep.backward(3.0 * x, [7.0, 8.0, 9.0, 0.0])
     c, d = np.array([0.1, 0.2]), np.array([0.3, 0.4, 0.5])
     z = x - f.in_offset
     expected = f.D @ z + f.P @ c + f.U @ d + f.out_offset
-    np.testing.assert_allclose(sweep.output(x, c, d), expected, rtol=1e-13, atol=1e-13)
+    out = sweep.output(x, np.append(c, SO_FAR), np.append(d, 0.0))
+    np.testing.assert_allclose(out, expected, rtol=1e-13, atol=1e-13)
     np.testing.assert_array_equal(sweep.estimate, node.initial_estimate[0])
 
 
 def test_starts_at_the_setpoint_it_is_told() -> None:
-    node = random_node(7, [(1, 1, 1, 1), (2, 3, 4, 5)])
+    node = random_node(7, [(2, 3, 4, 5), (2, 3, 4, 5)])
     sweep = NodeSweep(node, setpoint=1)
     np.testing.assert_array_equal(sweep.estimate, node.initial_estimate[1])
     assert sweep.command == node.initial_command[1]
-    assert (sweep.forward_received, sweep.backward_received) == (2, 4)
+    assert (sweep.forward_received, sweep.backward_received) == (2 + 3, 4 + 1)
 
 
 def test_selecting_a_setpoint_changes_the_factors_and_keeps_the_state() -> None:
-    node = random_node(8, [(1, 1, 1, 1), (2, 3, 4, 5)])
+    node = random_node(8, [(2, 3, 4, 5), (2, 3, 4, 5)])
     sweep = NodeSweep(node)
     before = sweep.estimate.copy()
     sweep.select(1)
@@ -99,20 +116,22 @@ def test_selecting_a_setpoint_changes_the_factors_and_keeps_the_state() -> None:
     np.testing.assert_array_equal(sweep.estimate, before)
     x = sweep.input([0.1, 0.2])
     f = node.setpoints[1]
-    expected = f.W @ [1.0, 2.0] + f.Q @ (x - f.in_offset)
-    np.testing.assert_allclose(sweep.forward(x, [1.0, 2.0]), expected, rtol=1e-13)
+    first = node.setpoints[0].out_offset  # the reference stays where the run rests
+    reference = np.concatenate([first, first[[1, 3]]])
+    expected = f.W @ [1.0, 2.0] + f.Q @ (x - reference)
+    np.testing.assert_allclose(sweep.forward(x, [1.0, 2.0, *SO_FAR])[:3], expected, rtol=1e-13)
 
 
-@pytest.mark.parametrize("count", [0, 1, 3])
+@pytest.mark.parametrize("count", [0, 2, 6])
 def test_a_sum_of_the_wrong_length_is_refused(count: int) -> None:
     sweep = NodeSweep(random_node(9, [(2, 2, 2, 2)]))
     x = sweep.input([0.0, 0.0])
-    with pytest.raises(OctarmError, match=rf"node 3: forward sum of {count} numbers.* needs 2"):
+    with pytest.raises(OctarmError, match=rf"node 3: forward sum of {count} numbers, expected 5"):
         sweep.forward(x, [0.0] * count)
-    with pytest.raises(OctarmError, match=rf"node 3: backward sum of {count} numbers.* needs 2"):
+    with pytest.raises(OctarmError, match=rf"node 3: backward sum of {count} numbers, expected 3"):
         sweep.backward(x, [0.0] * count)
     with pytest.raises(OctarmError, match="forward sum"):
-        sweep.output(x, [0.0] * count, [0.0] * 2)
+        sweep.output(x, [0.0] * count, [0.0] * 3)
 
 
 @pytest.mark.parametrize("setpoint", [-1, 2])
@@ -124,7 +143,67 @@ def test_a_setpoint_that_does_not_exist_is_refused(setpoint: int) -> None:
 def test_nothing_is_allocated_between_ticks() -> None:
     sweep = NodeSweep(random_node(11, [(2, 3, 4, 5)]))
     x = sweep.input([1.0, 2.0])
-    c_next, d_previous = sweep.forward(x, [1.0, 2.0]), sweep.backward(x, [1.0] * 4)
+    c_next, d_previous = sweep.forward(x, [1.0, 2.0, *SO_FAR]), sweep.backward(x, [1.0] * 5)
     assert sweep.input([0.0, 0.0]) is x
-    assert sweep.forward(x, [0.0, 0.0]) is c_next
-    assert sweep.backward(x, [0.0] * 4) is d_previous
+    assert sweep.forward(x, [0.0] * 5) is c_next
+    assert sweep.backward(x, [0.0] * 5) is d_previous
+
+
+def test_a_change_of_gains_is_announced_then_taken_and_leaves_no_jump() -> None:
+    """The command's deviation from the reference is held over the change; the difference is faded out."""
+    node = random_node(13, [(2, 3, 4, 5), (2, 3, 4, 5)])
+    fade = 0.75
+    sweep = NodeSweep(node, fade=fade)
+    reference = node.setpoints[0].out_offset[4]
+    random = np.random.default_rng(14)
+    commands, raw, bumps, used = [], [], [], []
+    for tick, announced in enumerate([0, 1, 1, 1, 1]):
+        x = sweep.input(random.standard_normal(2))
+        c, d = [*random.standard_normal(2), *SO_FAR], [*random.standard_normal(4), float(announced)]
+        used.append(sweep.setpoint)
+        f = node.setpoints[sweep.setpoint]
+        z = x - np.concatenate([node.setpoints[0].out_offset, node.setpoints[0].out_offset[[1, 3]]])
+        raw.append(float((f.D @ z + f.P @ c[:2] + f.U @ d[:4])[4]) + reference)
+        assert sweep.backward(x, d)[-1] == announced
+        sweep.accept(sweep.output(x, c, d))
+        assert sweep.next_setpoint == announced
+        commands.append(sweep.command)
+        bumps.append(sweep.bump)
+        assert sweep.tick == tick + 1
+    assert used == [0, 0, 1, 1, 1]
+    assert bumps[:2] == [0.0, 0.0]
+    assert commands[2] == pytest.approx(commands[1], rel=1e-13)
+    assert bumps[2] == pytest.approx(commands[1] - raw[2], rel=1e-13)
+    assert bumps[3:] == pytest.approx([bumps[2] * fade, bumps[2] * fade**2], rel=1e-13)
+    np.testing.assert_allclose(commands, np.add(raw, bumps), rtol=1e-12)
+
+
+def test_the_tip_decides_by_its_estimate_and_says_so_a_tick_later() -> None:
+    node = random_node(15, [(2, 0, 0, 4), (2, 0, 0, 4)])
+    sweep = NodeSweep(node, sectors=Sectors((0, 1), (0.5,), 0.1))
+    before = [0.0, 1.0, 0.2]  # angle 0.2 rad without this segment
+    beyond = [1.2, 1.0, 1.0]
+    announced = []
+    for so_far in (before, beyond, beyond, beyond):
+        sweep.estimate[2:] = 0.0
+        x = sweep.input([0.0, 0.0])
+        announced.append(sweep.backward(x, [])[-1])
+        sweep.accept(sweep.output(x, [0.1, 0.2, *so_far], []))
+    assert announced == [0.0, 0.0, 1.0, 1.0]
+    assert sweep.setpoint == 1
+
+
+def test_the_reference_of_this_tick_goes_in_and_that_of_the_next_comes_out() -> None:
+    node = random_node(16, [(2, 3, 4, 5)])
+    coefficients = np.random.default_rng(17).standard_normal((4, 5, 3))
+    reference = Reference(0.1, [Leg(0.1, 0.3, coefficients)])
+    sweep = NodeSweep(node, reference=reference)
+    f = node.setpoints[0]
+    for tick in range(6):
+        x = sweep.input([0.4, -0.6]).copy()
+        now, then = reference.at(tick), reference.at(tick + 1)
+        z = x - np.concatenate([now, now[[1, 3]]])
+        expected = f.D @ z + f.P @ [0.1, 0.2] + f.U @ [1.0, 2.0, 3.0, 4.0] + then
+        out = sweep.output(x, [0.1, 0.2, *SO_FAR], [1.0, 2.0, 3.0, 4.0, 0.0])
+        np.testing.assert_allclose(out, expected, rtol=1e-12, atol=1e-12)
+        sweep.accept(out * 0.1)

@@ -46,7 +46,7 @@ anything = st.recursive(
 def message(**changes: Any) -> bytes:
     """A good forward sum from node 2 with fields replaced."""
     fields: dict[str, Any] = {
-        "version": 1,
+        "version": 2,
         "kind": int(Kind.FORWARD_SUM),
         "run": RUN,
         "tick": 7,
@@ -97,9 +97,9 @@ def test_large_finite_numbers_are_not_mistaken_for_infinite_ones() -> None:
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"version": 2}, Reason.VERSION),
+        ({"version": 1}, Reason.VERSION),
         ({"version": 0}, Reason.VERSION),
-        ({"version": "1"}, Reason.VERSION),
+        ({"version": "2"}, Reason.VERSION),
         ({"version": True}, Reason.VERSION),
         ({"kind": int(Kind.BACKWARD_SUM)}, Reason.KIND),
         ({"kind": 99}, Reason.KIND),

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wire.errors import UsageError
-from wire.run_config import LinkConfig, NodeConfig, dumps, loads
+from wire.run_config import LegConfig, LinkConfig, NodeConfig, SchedulingConfig, dumps, loads
 
 LINKS = LinkConfig(("a",), ("b", "c"), None, 2.5, 10**18, 1)
 
@@ -22,9 +22,11 @@ def node(**changes: Any) -> NodeConfig:
         "nodes": 3,
         "ticks": 10,
         "setpoint": 0,
+        "scheduling": SchedulingConfig((0, 1), (30.0,), 2.0, 3.0),
         "batch_ticks": 32,
         "links": LINKS,
         "factors": {"D": [5, 7, bytes(range(256))], "deep": {"x": [b"", 1.5, None]}},
+        "reference": {"tick_s": 0.1, "legs": []},
     }
     return NodeConfig(**(fields | changes))
 
@@ -83,3 +85,25 @@ def test_nested_fields_are_named_with_their_path() -> None:
 def test_no_text_does_anything_but_load_or_be_refused(text: str | bytes) -> None:
     with pytest.raises(UsageError):
         loads(NodeConfig, text, "here")
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        (((0, 1), (), 2.0, 3.0), "boundaries_deg: expected 1 numbers for 2"),
+        (((0, 1, 2), (30.0, 20.0), 2.0, 3.0), "boundaries_deg: expected to increase"),
+        (((0,), (), -1.0, 3.0), "hysteresis_deg"),
+        (((0,), (), 2.0, 0.0), "bump_s"),
+    ],
+)
+def test_scheduling_is_checked(fields: Any, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        SchedulingConfig(*fields)
+
+
+@pytest.mark.parametrize(
+    ("move_s", "hold_s", "word"), [(0.0, 1.0, "move_s"), (1.0, -1.0, "hold_s")]
+)
+def test_legs_take_time(move_s: float, hold_s: float, word: str) -> None:
+    with pytest.raises(UsageError, match=word):
+        LegConfig("2", (), move_s, hold_s)
