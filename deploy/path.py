@@ -245,7 +245,9 @@ def _coefficients(arm: Arm, grid: SegmentGrid, found: _Samples, degree: int) -> 
     nodes[:, 0, 3] = _series(found.curvature, degree).T
     nodes[:, 0, 4] = _series(found.holding, degree).T
     nodes[:, 1, :2] = rates.transpose(2, 1, 0)
-    nodes[:, 1, 4] = arm.drag_per_s * push.T
+    # Kelvin-Voigt damping resists as a shape does that goes ahead by its time: exact for small bends
+    viscous = arm.kelvin_voigt_s * _by_sigma(_series(found.holding, degree))
+    nodes[:, 1, 4] = (arm.drag_per_s * push + viscous).T
     nodes[:, 2, 4] = _series(found.pull, degree).T
     nodes[:, 3, 4] = push.T
     plant = np.zeros((TERMS, len(PLANT), degree + 1))
