@@ -1,5 +1,6 @@
 """The film of a run: pictures that show what was recorded, a whole GIF or none, refusals."""
 
+import dataclasses
 import itertools
 import json
 import math
@@ -21,6 +22,7 @@ from analysis.recording import Recording, read_recording
 from analysis.scene import Scene
 from analysis.shape_error import arm_curves, face_positions
 from wire.errors import UsageError
+from wire.run_config import SchedulingConfig
 
 Array = npt.NDArray[np.float64]
 
@@ -112,16 +114,15 @@ def test_nothing_that_is_written_overlaps_or_leaves_the_picture(recording: Recor
         assert not (min(a.x1, b.x1) > max(a.x0, b.x0) and min(a.y1, b.y1) > max(a.y0, b.y0))
 
 
-def test_setpoints_have_sectors_midway_between_their_tips() -> None:
-    straight, bent = make_artefact().setpoints
-    high = math.atan2(bent.tip_m[1], bent.tip_m[0])
-    middle = 0.5 * high
-    expected = {0: (-middle, middle), 1: (middle, 3.0 * middle)}
-    for both, swap in (([straight, bent], False), ([bent, straight], True)):
-        found = sectors(both)
-        for index, edges in expected.items():
-            assert found[1 - index if swap else index] == pytest.approx(edges)
-    assert sectors([bent]) == {}
+def test_setpoints_have_sectors_midway_between_their_tips(recording: Recording) -> None:
+    _, bent = make_artefact().setpoints
+    middle = 0.5 * math.atan2(bent.tip_m[1], bent.tip_m[0])
+    assert sectors(recording) == {}
+    both = SchedulingConfig((0, 1), (math.degrees(middle),), 1.0, 2.0)
+    run = dataclasses.replace(recording.configuration, scheduling=both)
+    found = sectors(dataclasses.replace(recording, configuration=run))
+    assert found[0] == pytest.approx((-middle, middle))
+    assert found[1] == pytest.approx((middle, 3.0 * middle))
     assert len({colour(i) for i in range(6)}) == len(COLOURS) == 6
 
 
