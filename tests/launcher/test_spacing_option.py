@@ -30,7 +30,7 @@ def test_a_list_is_typed_or_read_from_a_file(tmp_path: Path) -> None:
 def test_the_run_is_deployed_on_the_boundaries(tmp_path: Path) -> None:
     gains = write_gains(tmp_path / "test.gains.json")
     options = RunOptions(gains=gains, nodes=4, spacing="0,0.1,0.3,0.6,1")
-    _, deployment = prepare(options)
+    deployment = prepare(options).deployment
     assert deployment.faces_m.tolist() == [0.0, 0.1, 0.3, 0.6, 1.0]
 
 
