@@ -44,7 +44,11 @@ class Channel:
             return 0.0
         T, B, C = self._schur
         shifted = 1j * omega * np.eye(len(T)) - T
-        response = C @ linalg.solve_triangular(shifted, B, check_finite=False) + self.D
+        if len(C) < B.shape[1]:  # from the side that has fewer signals
+            left = linalg.solve_triangular(shifted, C.T, trans="T", check_finite=False)
+            response = left.T @ B + self.D
+        else:
+            response = C @ linalg.solve_triangular(shifted, B, check_finite=False) + self.D
         return float(np.linalg.norm(response, 2))
 
     def hinf_norm(self) -> float:
