@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Wedge
 
+from analysis.estimated_arm import estimated_arms
 from analysis.goals import (
     active_setpoints,
     colour,
@@ -27,7 +28,6 @@ from analysis.goals import (
     visited,
 )
 from analysis.recording import Recording
-from analysis.shape_error import arm_curves
 
 Array = npt.NDArray[np.float64]
 Pixels = npt.NDArray[np.uint8]
@@ -58,12 +58,12 @@ class Scene:
 
     def __init__(self, recording: Recording, ticks: Sequence[int], width_px: int, note: str = ""):
         """Prepare the frames at the given ticks; note: a few words in the corner."""
-        run, artefact = recording.configuration, recording.artefact
+        artefact = recording.artefact
         chosen = np.asarray(ticks)
         self._ticks = {int(k): i for i, k in enumerate(ticks)}
         self._times = recording.times_s[chosen]
         self._shapes = recording.shapes_m[chosen]
-        self._estimates = arm_curves(recording.estimates[chosen], np.asarray(run.faces_m))
+        self._estimates = estimated_arms(recording, chosen.tolist())
         self._tips = recording.shapes_m[:, -1]
         self._trail_ticks = TRAIL * max(1, int(np.median(np.diff(chosen))))
         self._errors = recording.tip_error_m[chosen]

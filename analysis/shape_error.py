@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.interpolate import CubicSpline
 
 from deploy import Place, SegmentGrid
 from wire.channels import STATE
@@ -45,32 +44,6 @@ def face_positions(states: Array, faces_m: Array) -> Array:
     steps = np.stack([length * np.cos(angle), length * np.sin(angle)], axis=-1)
     positions: Array = np.cumsum(steps, axis=-2)
     return positions
-
-
-def arm_curves(states: Array, faces_m: Array, points: int = 65) -> Array:
-    """Smooth arms through absolute node states, for pictures: (..., points, 2), x and y in m, root to tip.
-
-    Where `face_positions` takes each segment as straight, as the nodes do, here the curvature between
-    the inner faces is a cubic spline that ends in the free tip's zero, and the strain is linear between
-    the segments' centres: closer to the arm by an order of magnitude (1 mm instead of 17 mm of the tip
-    at ten segments and the chapter's initial shape). states: (..., n, 4); faces_m: (n + 1,); points
-    are equally spaced in arclength. NaN in a state makes its whole arm NaN.
-    """
-    flat = states.reshape(-1, *states.shape[-2:])
-    whole = np.isfinite(flat).all(axis=(1, 2))
-    out = np.full((len(flat), points, 2), np.nan)
-    if not whole.any():
-        return out.reshape(*states.shape[:-2], points, 2)
-    s = np.linspace(0.0, faces_m[-1], points)
-    middle = 0.5 * (s[1:] + s[:-1])
-    curvature = np.pad(flat[whole, :, CURVATURE], ((0, 0), (0, 1)))
-    angle = CubicSpline(faces_m, curvature, axis=1).antiderivative()(middle)
-    centres = 0.5 * (faces_m[1:] + faces_m[:-1])
-    strain = np.array([np.interp(middle, centres, one[:, STRAIN]) for one in flat[whole]])
-    length = (1.0 + strain.reshape(-1, points - 1)) * np.diff(s)
-    steps = np.stack([length * np.cos(angle), length * np.sin(angle)], axis=-1)
-    out[whole] = np.pad(np.cumsum(steps, axis=1), ((0, 0), (1, 0), (0, 0)))
-    return out.reshape(*states.shape[:-2], points, 2)
 
 
 def shape_error(estimates: Array, truth: Array, faces_m: Array) -> Array:

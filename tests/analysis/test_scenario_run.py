@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from simulated_run import Scenario, make_artefact, write_recording
 
+from analysis.estimated_arm import estimated_arms
 from analysis.goals import active_setpoints, colour, reference_tips
 from analysis.open_loop import compare_with_open_loop
 from analysis.plot import draw_run, runs_of
@@ -91,6 +92,13 @@ def test_the_open_loop_model_follows_the_reference(recording: Recording) -> None
     observer, model = compare_with_open_loop(recording)
     assert 0.0 < observer.shape.norm.max() < 0.05
     assert 0.0 < model.shape.norm.max() < 0.1
+
+
+def test_the_estimated_arm_is_drawn_on_the_true_one(recording: Recording) -> None:
+    """Also on the way: the shape between setpoints is what the commands hold there."""
+    ticks = [10, 50, 65, 95, 140]
+    for k, arm in zip(ticks, estimated_arms(recording, ticks, 33), strict=True):
+        assert np.hypot(*(arm - recording.shapes_m[k]).T).max() < 0.01
 
 
 def test_the_table_has_legs_and_changes(recording: Recording) -> None:
