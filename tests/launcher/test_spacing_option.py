@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from closed_form import write_gains
 
-from supervise.plan import RunOptions, prepare
+from supervise.options import RunOptions
+from supervise.plan import prepare
 from supervise.spacing import parse_spacing, spacing_name
 from wire.errors import UsageError
 
