@@ -211,7 +211,7 @@ class _Pool:
         try:
             while waiting or self._running:
                 while waiting and len(self._running) < at_once:
-                    self._start(waiting.pop(0), one_thread=at_once > 1)
+                    self._start(waiting.pop(0))
                 next_end = min(worker.end for worker in self._running.values())
                 for pipe in wait([*self._running], max(0.0, next_end - time.monotonic())):
                     self._hear(self._running[pipe])  # type: ignore[index]
@@ -220,11 +220,12 @@ class _Pool:
             for worker in [*self._running.values()]:
                 self._finish(worker)
 
-    def _start(self, job: Job, *, one_thread: bool) -> None:
+    def _start(self, job: Job) -> None:
         self._progress(f"{job}: started")
         arguments = (self._file, job.index, job.role, self._options, self._work)
         name = f"octarm-{job.role}"
-        engine = Engine(_design, arguments, name=name, one_thread=one_thread)
+        # matrices this small take longer on several threads, and their rounding depends on the number
+        engine = Engine(_design, arguments, name=name, one_thread=True)
         self._running[engine.pipe] = _Worker(job, engine, time.monotonic() + self._limit_s)
 
     def _hear(self, worker: _Worker) -> None:

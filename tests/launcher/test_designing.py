@@ -71,7 +71,7 @@ def test_what_fails_is_named_and_the_rest_is_kept_for_the_next_design(
     assert f"setpoint 1, observer: {damaged}: no whole part" in "\n".join(told)
     assert any(line.startswith("setpoint 2, observer: taken from ") for line in told)
     assert "setpoint 2, observer: started" not in told
-    assert "setpoint 1, controller: at work, threads any" in told
+    assert "setpoint 1, controller: at work, threads 1" in told
     assert sorted(p.name for p in tmp_path.iterdir()) == ["arm.toml", "out.json"]
 
 
