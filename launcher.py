@@ -312,6 +312,8 @@ def study(
     nodes: Ints = (),
     tick: float | None = None,
     ticks: int | None = None,
+    spacing: Texts = (),
+    jobs: int | None = None,
     out: Path | None = None,
     force: Flag = False,
     json: Flag = False,
@@ -326,6 +328,8 @@ def study(
         nodes: Number of segments; may be given several times where several are compared.
         tick: Period of a tick in seconds.
         ticks: Number of ticks of a simulation.
+        spacing: Where the segments end; may be given several times where several are compared.
+        jobs: Processes at once; default: one a processor.
         out: Directory for the facts (JSON) and the plot (PNG), made if missing.
         force: Write over existing files.
         json: Print one JSON object instead of the table.
@@ -338,6 +342,8 @@ def study(
         "nodes": nodes,
         "tick": None if tick is None else (tick,),
         "ticks": None if ticks is None else (ticks,),
+        "spacing": spacing,
+        "jobs": None if jobs is None else (jobs,),
     }
     done = run_study(name, gains, choices, out, teller(silent=quiet or json), force=force)
     show_json(done.facts) if json else print(

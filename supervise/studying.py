@@ -50,11 +50,11 @@ def run_study(
     module = importlib.import_module(f"analysis.study.{name}")
     keywords = keywords_of(name, module.run, choices)
     targets = _targets(name, module, out, force)
-    facts = finite(module.run(read_artefact(gains), progress, **keywords))
-    facts = {"study": name, "gains": str(gains), **facts}
+    found = module.run(read_artefact(gains), progress, **keywords)
+    found = {"study": name, "gains": str(gains), **found}
     for target in targets:
-        _write(target, module, facts)
-    return Study(facts, module.table(facts), targets)
+        _write(target, module, found)
+    return Study(finite(found), module.table(found), targets)
 
 
 def keywords_of(name: str, run: Callable[..., Any], choices: Choices) -> dict[str, Any]:
@@ -112,7 +112,7 @@ def _write(target: Path, module: ModuleType, facts: dict[str, Any]) -> None:
     growing = Path(name)
     try:
         if target.suffix == ".json":
-            growing.write_text(json.dumps(facts, indent=1, allow_nan=False) + "\n")
+            growing.write_text(json.dumps(finite(facts), indent=1, allow_nan=False) + "\n")
         else:
             module.plot(facts, growing)
         growing.chmod(0o644)

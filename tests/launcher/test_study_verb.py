@@ -71,7 +71,7 @@ def test_table_and_progress_go_where_they_belong(
     )
     printed, told = capsys.readouterr()
     assert seen == [{"setpoints": ("2",), "nodes": 6, "tick_s": 0.05}]
-    assert printed.splitlines()[:2] == ["gamma 0.25", "gamma None"]
+    assert printed.splitlines()[:2] == ["gamma 0.25", "gamma inf"]
     assert told == "case 1 of 2\n"
     assert sorted(p.name for p in out.iterdir()) == ["baselines.json", "baselines.png"]
     written = json.loads((out / "baselines.json").read_text())
@@ -104,6 +104,7 @@ def test_nothing_is_written_over_unasked(
     ("arguments", "culprit"),
     [
         (("baselines", "--ticks", "9"), "--ticks: the study of baselines does not offer"),
+        (("baselines", "--jobs", "1"), "it has --setpoint, --nodes, --tick"),
         (
             ("baselines", "--nodes", "5", "--nodes", "6"),
             "--nodes: the study of baselines takes one",
