@@ -130,7 +130,7 @@ def make_references(
         here = leg.to
     return References(
         nodes=tuple(
-            Reference(tick_s, [Leg(t, m, nodes[i]) for t, m, nodes, _ in moves])
+            Reference(tick_s, [Leg(t, m, nodes[i]) for t, m, nodes, _ in moves], held=1)
             for i in range(grid.nodes)
         ),
         plant=Reference(tick_s, [Leg(t, m, plant) for t, m, _, plant in moves]),

@@ -13,7 +13,7 @@ the a are made of, is said where the tables are made, in deploy.path).
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -70,9 +70,12 @@ class Leg:
 
 
 class Reference:
-    """What a run wants at each tick; `at(k)` gives the quantities (q,), read-only, the same array at rest."""
+    """What a run wants at each tick; `at(k)` gives the quantities (q,), read-only, the same array at rest.
 
-    def __init__(self, tick_s: float, legs: Sequence[Leg]) -> None:
+    The last `held` quantities are commands, which stay as they are for a tick: they are taken in its middle.
+    """
+
+    def __init__(self, tick_s: float, legs: Sequence[Leg], held: int = 0) -> None:
         if not legs:
             raise UsageError("reference: no leg; a rest is one of 0 s")
         begins = [leg.begin_s for leg in legs]
@@ -83,29 +86,39 @@ class Reference:
             )
         self.tick_s = tick_s
         self.legs = tuple(legs)
+        self.held = held
         self._begins, self._ends = begins, ends
         self._flat = [leg.coefficients.reshape(-1, leg.coefficients.shape[2]) for leg in legs]
         self._orders = [np.arange(leg.coefficients.shape[2], dtype=np.float64) for leg in legs]
-        self._first = self._moving(0, 0.0)
-        self._last = [
-            self._moving(i, 1.0 if leg.move_s > 0.0 else 0.0) for i, leg in enumerate(legs)
-        ]
+        self._last = [self._moving(i, 1.0) for i in range(len(legs))]
+        self._first = self._moving(0, 0.0) if legs[0].move_s > 0.0 else self._last[0]
 
     def at(self, tick: int) -> Array:
-        """The quantities (q,) at the start of a tick."""
+        """The quantities (q,) at the start of a tick, those that are held in its middle."""
+        now = self._when(tick * self.tick_s)
+        if not self.held:
+            return now
+        middle = self._when((tick + 0.5) * self.tick_s)
+        if middle is now:
+            return now
+        out = now.copy()
+        out[-self.held :] = middle[-self.held :]
+        out.flags.writeable = False
+        return out
+
+    def rests(self, tick: int) -> bool:
+        """Whether nothing moves at the start of a tick."""
         t = tick * self.tick_s
-        index = bisect_right(self._begins, t) - 1
+        index = bisect_left(self._begins, t) - 1
+        return index < 0 or t >= self._ends[index]
+
+    def _when(self, t: float) -> Array:
+        index = bisect_left(self._begins, t) - 1
         if index < 0:
             return self._first
         if t >= self._ends[index]:
             return self._last[index]
         return self._moving(index, (t - self._begins[index]) / self.legs[index].move_s)
-
-    def rests(self, tick: int) -> bool:
-        """Whether nothing moves at the start of a tick."""
-        t = tick * self.tick_s
-        index = bisect_right(self._begins, t) - 1
-        return index < 0 or t >= self._ends[index]
 
     def _moving(self, index: int, fraction: float) -> Array:
         sigma, rate, second = progress(fraction)
@@ -124,7 +137,7 @@ class Reference:
             [leg.begin_s, leg.move_s, *leg.coefficients.shape, _bytes(leg.coefficients)]
             for leg in self.legs
         ]
-        return {"tick_s": self.tick_s, "legs": legs}
+        return {"tick_s": self.tick_s, "held": self.held, "legs": legs}
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> Reference:
@@ -134,7 +147,7 @@ class Reference:
                 Leg(begin, move, np.frombuffer(raw, dtype="<f8").reshape(shape).astype(np.float64))
                 for begin, move, *shape, raw in plain["legs"]
             ]
-            return cls(float(plain["tick_s"]), legs)
+            return cls(float(plain["tick_s"]), legs, int(plain["held"]))
         except (KeyError, TypeError, ValueError) as error:
             raise UsageError(f"reference: damaged ({error}); deploy the gains again") from None
 
