@@ -248,8 +248,10 @@ def _stops(s: dict[str, Any]) -> str:
 
 
 def _story(s: dict[str, Any]) -> str:
-    by = f"setpoint {s['setpoint']}" if len(s["legs"]) <= 1 else f"scenario {s['scenario']}"
-    return by if s["control"] else f"{by}, no feedback"
+    parts = [] if s["scenario"] == "hold" else [f"scenario {s['scenario']}"]
+    parts += [] if len(s["legs"]) > 1 else [f"setpoint {s['setpoint']}"]
+    parts += [] if s["control"] else ["no feedback"]
+    return ", ".join(parts)
 
 
 def _where(s: dict[str, Any]) -> str:
