@@ -63,9 +63,11 @@ def tip_to_root(arm: Arm, load: Callable[[float], float], tip_angle: float, brea
 
 def rest(arm: Arm, load: Callable[[float], float], guess: float, breaks: Array) -> Array:
     """(theta, x, y, M) at the breaks, root to tip; they go from 0 to the length, with all kinks of the load."""
-    (angle,) = fsolve(
-        lambda a: tip_to_root(arm, load, float(a[0]), breaks)[-1, 2], [guess], xtol=1e-12
-    )
+
+    def at_root(angle: Array) -> float:
+        return float(tip_to_root(arm, load, float(angle[0]), breaks)[-1, 2])
+
+    (angle,) = fsolve(at_root, [guess], xtol=1e-12)
     found = tip_to_root(arm, load, float(angle), breaks)[::-1]
     place = found[:, :2] - found[0, :2]
     return np.column_stack([found[:, 2], place, found[:, 3]])

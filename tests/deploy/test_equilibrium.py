@@ -50,11 +50,12 @@ def test_an_arm_that_accelerates_keeps_its_shape_under_the_load_for_it() -> None
     ax, ay = (legendre.legval(2.0 * s - 1.0, one) for one in acceleration)
     force = legendre.legval(2.0 * s - 1.0, extra)
 
-    def beyond(f: Array) -> Array:
+    def beyond(f: npt.ArrayLike) -> Array:
+        f = np.asarray(f, dtype=np.float64)
         pieces = 0.5 * (f[1:] + f[:-1]) * np.diff(s)
         return np.append(np.cumsum(pieces[::-1])[::-1], 0.0)
 
-    across = -np.sin(angle) * beyond(-mass * ax) + np.cos(angle) * beyond(force - mass * ay)
+    across: Array = -np.sin(angle) * beyond(-mass * ax) + np.cos(angle) * beyond(force - mass * ay)
     size = float(np.max(np.abs(beyond(force))))
     assert size > 1e-3
     np.testing.assert_allclose(across, 0.0, atol=1e-6 * size)
