@@ -134,6 +134,7 @@ def _check(counts: Sequence[int], spacings: Sequence[str], ticks: int, initial: 
 def _reference(one: Limit) -> dict[str, Any]:
     return {
         "gamma": list(one.gamma),
+        "slowest_per_s": list(one.slowest_per_s),
         "eigenvalues": [[[v.real, v.imag] for v in values] for values in one.eigenvalues],
         "own_error": one.accuracy,
     }
@@ -189,6 +190,12 @@ def table(facts: dict[str, Any]) -> str:
     )
     head = f"{'setpoint':<10} {'spacing':<11}" + "".join(f"{f'n = {n}':>10}" for n in counts)
     head += "   order"
+    lines += ["", f"{'without segments':<22} {'gamma':>9} {'slowest mode [1/s]':>20}"]
+    for name, one in facts["references"].items():
+        for role, gamma, decay in zip(
+            ("observer", "controller"), one["gamma"], one["slowest_per_s"], strict=True
+        ):
+            lines.append(f"{name:<10} {role:<11} {gamma:>9.5f} {decay:>20.5f}")
     for quantity, meaning in facts["quantities"].items():
         lines += ["", f"{quantity}: {meaning}", head, "─" * (len(head) + 5 * len(counts) - 9)]
         lines += [

@@ -37,6 +37,7 @@ from deploy.grid import (
 )
 from deploy.operators import operator_matrix
 from design import verify
+from design.arm_file import time_unit_s
 from design.channel import Channel
 from plant.initial import InitialShape, initial_shape, legendre_profile
 from wire.artefact import Arm, GainsArtefact, OperatorFactors, Setpoint
@@ -52,6 +53,9 @@ SHAPES = 4
 """Places along the arm, equally spaced to the tip, where shapes are compared."""
 TESTS = 3
 """Smooth states that the gain operators are tried on."""
+FASTEST_RAD_PER_S = 30.0
+"""Modes above it, faster than a tick of 0.1 s can turn, are left out of the decay. The gains hardly damp the
+axial ones among them: their decay tends to half the drag with the frequency, however fine the grid."""
 COARSER = 16
 """Polynomials of the second reference, from which the first one's own error is judged."""
 CLAMPED_FREE = (1.8751040687119611, 0.7340955137589128)
@@ -66,6 +70,8 @@ QUANTITIES = {
     "controller gamma": "H-infinity norm with state feedback, relative",
     "observer eigenvalues": f"{LEADING} smallest of the error dynamics, worst, relative",
     "controller eigenvalues": f"{LEADING} smallest of the controlled arm, worst, relative",
+    "observer decay": f"slowest mode of the error below {FASTEST_RAD_PER_S:g} rad/s, relative",
+    "controller decay": f"slowest mode of the controlled arm below {FASTEST_RAD_PER_S:g} rad/s, relative",
     "tip": "sampled loop on the exact arm: rms over the run, mm",
     "estimated shape": "sampled loop on the exact arm: rms over run and arm, mm",
     "tip at rest": "distance from the setpoint's tip at rest, mm",
@@ -90,6 +96,8 @@ class Limit:
     gamma: tuple[float, float]
     """Of observer and controller."""
     eigenvalues: tuple[Complex, Complex]
+    slowest_per_s: tuple[float, float]
+    """Decay of the slowest mode below `FASTEST_RAD_PER_S`."""
     course: SampledCourse | None
     accuracy: dict[str, float]
     """Difference to a reference of fewer polynomials, per quantity, in the unit of its errors."""
@@ -128,6 +136,11 @@ def _leading(A: Array) -> Complex:
     return np.asarray(values[np.argsort(np.abs(values))][:LEADING])
 
 
+def _slowest(arm: Arm, A: Array) -> float:
+    values = np.linalg.eigvals(A) / time_unit_s(arm)
+    return float(-np.max(values.real[np.abs(values.imag) < FASTEST_RAD_PER_S]))
+
+
 def _apart(A: Array, reference: Complex) -> float:
     """Largest relative distance of a reference value from the nearest eigenvalue of A."""
     values = np.linalg.eigvals(A).astype(np.complex128)
@@ -143,14 +156,16 @@ def limit(artefact: GainsArtefact, name: str, choices: Choices | None) -> Limit:
     )
     gamma = (fine[0].hinf_norm(), fine[1].hinf_norm())
     eigenvalues = (_leading(fine[0].A), _leading(fine[1].A))
+    slowest = (_slowest(arm, fine[0].A), _slowest(arm, fine[1].A))
     accuracy = {}
-    for role, one, value, leading in zip(
-        ("observer", "controller"), coarse, gamma, eigenvalues, strict=True
+    for role, one, value, leading, decay in zip(
+        ("observer", "controller"), coarse, gamma, eigenvalues, slowest, strict=True
     ):
         accuracy[f"{role} gamma"] = abs(one.hinf_norm() / value - 1.0)
         accuracy[f"{role} eigenvalues"] = _apart(one.A, leading)
+        accuracy[f"{role} decay"] = abs(_slowest(arm, one.A) / decay - 1.0)
     if choices is None:
-        return Limit(gamma, eigenvalues, None, accuracy)
+        return Limit(gamma, eigenvalues, slowest, None, accuracy)
     course, other = (
         sampled_course(
             arm,
@@ -167,7 +182,7 @@ def limit(artefact: GainsArtefact, name: str, choices: Choices | None) -> Limit:
     )
     accuracy["tip"] = 1e3 * _rms(course.tip_m - other.tip_m)
     accuracy["estimated shape"] = 1e3 * _rms(course.estimate_m - other.estimate_m)
-    return Limit(gamma, eigenvalues, course, accuracy)
+    return Limit(gamma, eigenvalues, slowest, course, accuracy)
 
 
 def _places(arm: Arm) -> Array:
@@ -195,6 +210,8 @@ def grid_errors(
     for k, role in enumerate(("observer", "controller")):
         errors[f"{role} gamma"] = abs(loops[k].hinf_norm() / reference.gamma[k] - 1.0)
         errors[f"{role} eigenvalues"] = _apart(loops[k].A, reference.eigenvalues[k])
+        decay = reference.slowest_per_s[k]
+        errors[f"{role} decay"] = abs(_slowest(arm, loops[k].A) / decay - 1.0)
     if choices is None:
         return errors
     try:
