@@ -212,6 +212,6 @@ def _write(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
         append_images=frames[1:],
         duration=durations,
         loop=0,
-        optimize=False,
+        optimize=True,  # what stays is transparent: a quarter of the bytes
         disposal=1,
     )
