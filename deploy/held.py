@@ -161,9 +161,13 @@ class _Statics:
             return None
         for _ in range(GAUSS_NEWTON):
             turns = shape.turns(self._force)
-            weight = WEAKEST * np.linalg.norm(turns, 2) * np.eye(len(command))
-            right = np.concatenate([wanted - shape.angle, weight @ (first_n_per_m - command)])
-            change = np.linalg.lstsq(np.vstack([turns, weight]), right, rcond=None)[0]
+            # least squares of the misfit, with a little weight on the distance from the first commands
+            left, singular, right = np.linalg.svd(turns, full_matrices=False)
+            weight = (WEAKEST * singular[0]) ** 2
+            turn = singular * (left.T @ (wanted - shape.angle))
+            change = right.T @ (
+                (turn + weight * (right @ (first_n_per_m - command))) / (singular**2 + weight)
+            )
             misfit = float(np.linalg.norm(shape.angle - wanted))
             for _ in range(HALVINGS):  # a step that makes the misfit larger is cut in half
                 after = self._shape(command + change, shape.angle)

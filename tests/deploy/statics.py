@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 from scipy.integrate import solve_ivp
-from scipy.optimize import fsolve
+from scipy.optimize import brentq
 
 from wire.artefact import Arm
 
@@ -64,10 +64,10 @@ def tip_to_root(arm: Arm, load: Callable[[float], float], tip_angle: float, brea
 def rest(arm: Arm, load: Callable[[float], float], guess: float, breaks: Array) -> Array:
     """(theta, x, y, M) at the breaks, root to tip; they go from 0 to the length, with all kinks of the load."""
 
-    def at_root(angle: Array) -> float:
-        return float(tip_to_root(arm, load, float(angle[0]), breaks)[-1, 2])
+    def at_root(angle: float) -> float:
+        return float(tip_to_root(arm, load, angle, breaks)[-1, 2])
 
-    (angle,) = fsolve(at_root, [guess], xtol=1e-12)
+    angle = brentq(at_root, guess - 0.05, guess + 0.05, xtol=1e-12)
     found = tip_to_root(arm, load, float(angle), breaks)[::-1]
     place = found[:, :2] - found[0, :2]
     return np.column_stack([found[:, 2], place, found[:, 3]])
