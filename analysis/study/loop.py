@@ -21,7 +21,8 @@ from design.channel import Channel
 from plant.disturbance import DisturbanceSpec
 from plant.initial import initial_shape
 from plant.model import ArmPlant, PlantParameters
-from wire.artefact import Arm, Setpoint
+from wire.artefact import Arm, GainsArtefact, Setpoint
+from wire.errors import UsageError
 
 Array = npt.NDArray[np.float64]
 
@@ -221,6 +222,19 @@ def decay_per_s(spectral_radius: float, tick_s: float) -> float:
     return -math.log(spectral_radius) / tick_s
 
 
+def design_weights(artefact: GainsArtefact) -> tuple[float, float]:
+    """Of measurement noise and control effort; UsageError if the artefact does not say."""
+    keys = ("measurement_noise", "control_effort")
+    for key in keys:
+        if key not in artefact.weights:
+            raise UsageError(
+                f"gains artefact: expected the design's weight {key!r}, got {', '.join(artefact.weights)}; "
+                "make the gains with `octarm design`"
+            )
+    noise, effort = (artefact.weights[key] for key in keys)
+    return noise, effort
+
+
 def loop_channel(
     arm: SampledArm,
     step: DenseStep,
@@ -258,7 +272,9 @@ def loop_channel(
     truth = arm.truth.reshape(n, 4, m)
     C[0, :m] = share[:, 0] @ truth[:, 1] / y_unit[0]
     C[1, :m] = share[:, 1] @ truth[:, 3] / y_unit[1]
-    C[2:, m + 4 : m + 5 * n : 5] = np.diag(effort * np.sqrt(share[:, 0]) / unit_load)
+    loaded = share[:, 0].copy()
+    loaded[0] += grid.centres_m[0] / length  # the arm carries the first command from the clamp on
+    C[2:, m + 4 : m + 5 * n : 5] = np.diag(effort * np.sqrt(loaded) / unit_load)
     return bilinear(matrix, B, C, 2.0 * time / deployment.tick_s)
 
 

@@ -17,12 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from analysis.metrics import time_below
+from analysis.study.figures import grouped_bars
 from analysis.study.loop import (
     GROWTH_PER_S,
     Case,
     Rest,
     closed_loop,
     decay_per_s,
+    design_weights,
     find_rest,
     linear_arm,
     loop_channel,
@@ -88,12 +90,7 @@ def run(
         artefact.setpoint_index(name)
     if ticks < 10:
         raise UsageError(f"robustness: expected at least 10 ticks, got {ticks}")
-    for key in ("measurement_noise", "control_effort"):
-        if key not in artefact.weights:
-            raise UsageError(
-                f"gains artefact: expected the design's weight {key!r}, got {', '.join(artefact.weights)}; "
-                "make the gains with `octarm design`"
-            )
+    design_weights(artefact)
     deploy(artefact, nodes, tick_s)  # refused here, not in a worker
     every = cases(artefact.arm, nodes)
     chunks = [
@@ -190,15 +187,9 @@ def _row(
     if rest is not None:
         decay = decay_per_s(radius(closed_loop(rest.arm, step, case)), deployment.tick_s)
         offset = float(np.hypot(*(rest.tip_m - np.asarray(setpoint.tip_m))))
-        weights = artefact.weights
+        noise, effort = design_weights(artefact)
         value = loop_channel(
-            rest.arm,
-            step,
-            case,
-            deployment,
-            artefact.arm,
-            weights["measurement_noise"],
-            weights["control_effort"],
+            rest.arm, step, case, deployment, artefact.arm, noise, effort
         ).hinf_norm()
         norm = value if math.isfinite(value) else None
     why = verdict(found, rest, decay)
@@ -277,19 +268,19 @@ def table(facts: dict[str, Any]) -> str:
         if before not in (None, row["setpoint"]):
             lines.append("")
         before = row["setpoint"]
-        change = _number(row["norm_change_percent"], "+.0f")
+        change = number(row["norm_change_percent"], "+.0f")
         lines.append(
             _line(
                 [
                     row["setpoint"],
                     row["case"] + (f", node {row['node']}" if row["node"] is not None else ""),
                     "yes" if row["stable"] else "no",
-                    _number(row["decay_per_s"], ".4f"),
-                    _number(row["linear_decay_per_s"], ".4f"),
-                    _number(row["rest_error_m"], ".2f", 1e3),
-                    _number(row["tip_error_m"], ".2f", 1e3),
-                    _number(row["settling_s"], ".1f"),
-                    _number(row["norm"], ".4f"),
+                    number(row["decay_per_s"], ".4f"),
+                    number(row["linear_decay_per_s"], ".4f"),
+                    number(row["rest_error_m"], ".2f", 1e3),
+                    number(row["tip_error_m"], ".2f", 1e3),
+                    number(row["settling_s"], ".1f"),
+                    number(row["norm"], ".4f"),
                     change if change == "-" else f"{change} %",
                 ]
             )
@@ -307,14 +298,13 @@ def table(facts: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _number(value: float | None, form: str, factor: float = 1.0) -> str:
+def number(value: float | None, form: str, factor: float = 1.0) -> str:
+    """A figure of a table, a dash where there is none."""
     return "-" if value is None else format(factor * value, form)
 
 
 def plot(facts: dict[str, Any], path: Path) -> None:
     """Bars of the tip's error at rest and of the norm, a group a case, a colour a setpoint."""
-    from analysis.study.bars import grouped_bars
-
     rows = facts["rows"]
     names = list(dict.fromkeys(row["case"] for row in rows))
     setpoints = list(dict.fromkeys(row["setpoint"] for row in rows))

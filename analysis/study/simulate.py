@@ -58,7 +58,7 @@ class Simulation:
     tip_m: Array
     """(K, 2)."""
     tip_error_m: Array
-    """(K,) distance of the tip from the setpoint's."""
+    """(K,) distance of the tip from the setpoint's in the artefact; a run's is from the shape that it holds."""
     shapes_m: Array
     """(K, p, 2): positions at the arclengths asked for."""
     plant_state: Array

@@ -22,7 +22,7 @@ from wire.errors import UsageError
 
 WEIGHTS = {"measurement_noise": 0.1, "control_effort": 0.1}
 GAINS = msgspec.structs.replace(make_artefact(), weights=WEIGHTS)
-CHOICES: dict[str, Any] = {"setpoints": ["bent"], "nodes": 2, "ticks": 600, "plant_cells": 8}
+CHOICES: dict[str, Any] = {"setpoints": ["bent"], "nodes": 2, "ticks": 350, "plant_cells": 8}
 
 
 @pytest.fixture(scope="module")

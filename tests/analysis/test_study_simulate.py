@@ -40,7 +40,7 @@ def test_it_gives_the_numbers_of_a_run(tmp_path: Path) -> None:
         (ours.measurements, recording.measurements),
         (ours.estimates, recording.estimates),
         (ours.commands_n_per_m, recording.commands),
-        (ours.tip_error_m, recording.tip_error_m),
+        (ours.tip_m, recording.of_plant("tip", ("x_m", "y_m"))),
         (ours.times_s, recording.times_s),
     ):
         np.testing.assert_allclose(got, expected, rtol=0.0, atol=1e-11 * np.abs(expected).max())
