@@ -132,6 +132,7 @@ def design(
     *,
     arm: Path = DEFAULT_ARM,
     out: Path | None = None,
+    only: tuple[str, ...] = (),
     jobs: int | None = None,
     solver: str = "CLARABEL",
     time_limit: float = 300.0,
@@ -147,6 +148,8 @@ def design(
         out: Gains artefact to write, default <name of the arm file>.gains.json in this folder; written
             when every gain is certified. Until then finished gains are kept in <out>.parts, for the
             next design.
+        only: Gains to design and keep for the next design, without writing an artefact: SETPOINT or
+            SETPOINT:ROLE (observer, controller).
         jobs: Gains worked on at once, each in a process of its own; default: one a processor.
         solver: Semidefinite solver, by its name in CVXPY.
         time_limit: Seconds for one semidefinite program; a gain takes a few.
@@ -161,14 +164,16 @@ def design(
 
     out = out or Path(f"{arm.stem}.gains.json")
     options = Options(solver=solver, time_limit_s=time_limit)
-    request = Request(arm, out, options, jobs, fresh=fresh, force=force)
-    artefact, digest = run_design(request, teller(silent=quiet or json))
-    rows = gain_rows(artefact)
+    request = Request(arm, out, options, jobs, fresh=fresh, force=force, only=only)
+    done = run_design(request, teller(silent=quiet or json))
+    rows = gain_rows((j.setpoint, j.role, g.certificate) for j, g in done.gains.items())
+    written = done.sha256 is not None
     if json:
-        show_json({"artefact": str(out), "sha256": digest, "gains": rows})
+        file = {"artefact": str(out) if written else None, "sha256": done.sha256}
+        show_json(file | {"parts": None if written else str(done.parts), "gains": rows})
     else:
         print(gain_table(rows))
-        print(f"{out}, SHA-256 {digest[:16]}")
+        print(f"{out}, SHA-256 {done.sha256[:16]}" if done.sha256 else f"kept in {done.parts}")
     return int(ExitCode.OK)
 
 

@@ -1,15 +1,15 @@
-"""What `octarm design` shows at its end: one row a gain, from the certificates of the artefact.
+"""What `octarm design` shows at its end: one row a gain.
 
-Takes the artefact that was written, gives rows for --json and text for a person. The verdict compares with what
-the design is to reach; a gain that is certified runs, whatever the verdict.
+Takes the certificates, gives rows for --json and text for a person. The verdict compares with what the design
+is to reach; a gain that is certified runs, whatever the verdict.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-from wire.artefact import Certificate, GainsArtefact
+from wire.artefact import Certificate
 
 FIGURES = (
     "certified_gamma",
@@ -37,19 +37,15 @@ _HEAD = (
 )
 
 
-def gain_rows(artefact: GainsArtefact) -> list[dict[str, Any]]:
-    """Per setpoint and gain: `setpoint`, `role` (observer, controller), the `FIGURES`, ratios and verdict.
+def gain_rows(gains: Iterable[tuple[str, str, Certificate]]) -> list[dict[str, Any]]:
+    """A row for every gain, given as setpoint, role and certificate: these names, the `FIGURES`, the verdict.
 
     `certified_ratio` and `achieved_ratio` are to the optimum, `decay_ratio` is to the open loop's (None if that
     is unknown or no decay). `targets_missed` names those of certified, achieved, decay that miss their targets.
     """
     return [
-        {"setpoint": setpoint.name, "role": role, **_row(certificate, DECAY_TARGET[role])}
-        for setpoint in artefact.setpoints
-        for role, certificate in (
-            ("observer", setpoint.observer_certificate),
-            ("controller", setpoint.controller_certificate),
-        )
+        {"setpoint": setpoint, "role": role, **_row(certificate, DECAY_TARGET[role])}
+        for setpoint, role, certificate in gains
     ]
 
 

@@ -44,6 +44,8 @@ class Request:
     """Take no part of an earlier design."""
     force: bool = False
     """Write over an existing artefact."""
+    only: tuple[str, ...] = ()
+    """Gains, each as SETPOINT or SETPOINT:ROLE, that are designed and kept as parts; no artefact is written."""
 
     def __post_init__(self) -> None:
         limit = self.options.time_limit_s
@@ -53,48 +55,77 @@ class Request:
             raise UsageError(f"--jobs: expected at least 1, got {self.jobs}")
 
 
+@dataclass(frozen=True)
+class Designed:
+    """What came of it. `artefact` and `sha256` are None if only some gains were asked for."""
+
+    gains: dict[Job, GainDesign]
+    """In the order of the artefact."""
+    artefact: GainsArtefact | None
+    sha256: str | None
+    parts: Path
+    """Where the gains are kept until there is an artefact."""
+
+
 def run_design(
     request: Request,
     progress: Tell = lambda _: None,
     work: Work = design_gain,
     grace_s: float = GRACE_S,
-) -> tuple[GainsArtefact, str]:
-    """Design all setpoints of an arm file and write the artefact; returns it and its SHA-256 digest.
+) -> Designed:
+    """Design the gains of an arm file and write the artefact if all were asked for.
 
     Raises UsageError for a bad arm file, option or output path, before the work starts, and, when all other
     gains are finished and kept, GainsRefusedError if a gain is not certified (the message names setpoint and
     role), EngineDiedError if its process ended early, and RuntimeError for an error of the program.
     """
     file = read_arm_file(request.arm)
-    _check_output(request.out, force=request.force)
+    _check_output(request)
     check_options(request.options)
-    everything = jobs(file)
+    wanted = _wanted(jobs(file), request)
     parts = GainParts(request.out, file, request.options)
     with parts.locked():
-        gains = {} if request.fresh else _kept(parts, everything, progress)
-        todo = longest_first(file, [job for job in everything if job not in gains])
+        gains = {} if request.fresh else _kept(parts, wanted, jobs(file), progress)
+        todo = longest_first(file, [job for job in wanted if job not in gains])
 
         def keep(job: Job, gain: GainDesign) -> None:
             gains[job] = gain
             _keep(parts, job, gain, progress)
-            progress(f"{job}: finished, {len(gains)} of {len(everything)} gains")
+            progress(f"{job}: finished, {len(gains)} of {len(wanted)} gains")
 
         pool = _Pool(file, request.options, work, grace_s, keep, progress)
         try:
             pool.run(todo, request.jobs or processors())
         except KeyboardInterrupt:
-            progress(f"interrupted; {_balance(parts, gains, everything)}")
+            progress(f"interrupted; {_balance(parts, gains, wanted)}")
             raise
         if pool.failures:
-            raise _joined(pool.failures, _balance(parts, gains, everything))
+            raise _joined(pool.failures, _balance(parts, gains, wanted))
+        gains = {job: gains[job] for job in wanted}
+        if request.only:
+            return Designed(gains, None, None, parts.directory)
         artefact = assemble(file, gains)
-        _check_output(request.out, force=request.force)  # minutes have passed
+        _check_output(request)  # minutes have passed
         try:
             sha = write_artefact(artefact, request.out)
         except OSError as error:
             raise UsageError(f"--out {request.out}: {error.strerror or error}") from None
         parts.remove()
-    return artefact, sha
+    return Designed(gains, artefact, sha, parts.directory)
+
+
+def _wanted(everything: list[Job], request: Request) -> list[Job]:
+    """The jobs that --only names, all without it. UsageError for a name that there is not."""
+    names = {text: [job] for job in everything for text in [f"{job.setpoint}:{job.role}"]}
+    for job in everything:
+        names.setdefault(job.setpoint, []).append(job)
+    for text in request.only:
+        if text not in names:
+            raise UsageError(
+                f"--only {text}: expected SETPOINT or SETPOINT:ROLE, one of {', '.join(names)}"
+            )
+    chosen = {job for text in request.only for job in names[text]}
+    return [job for job in everything if job in chosen or not request.only]
 
 
 def processors() -> int:
@@ -102,14 +133,15 @@ def processors() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def _check_output(path: Path, *, force: bool) -> None:
+def _check_output(request: Request) -> None:
     """UsageError, now and not after minutes of work, if nothing can be written there."""
+    path = request.out
     existing = path.parent
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
     if path.is_dir():
         raise UsageError(f"--out {path}: is a directory; give the name of a file")
-    if path.exists() and not force:
+    if path.exists() and not (request.force or request.only):
         raise UsageError(f"--out {path}: it exists already; give another name or --force")
     if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
         raise UsageError(f"--out {path}: {existing} is no directory that can be written to")
@@ -118,10 +150,12 @@ def _check_output(path: Path, *, force: bool) -> None:
 # Parts
 
 
-def _kept(parts: GainParts, everything: Sequence[Job], progress: Tell) -> dict[Job, GainDesign]:
-    """The gains that an earlier design has left."""
+def _kept(
+    parts: GainParts, wanted: Sequence[Job], everything: Sequence[Job], progress: Tell
+) -> dict[Job, GainDesign]:
+    """The wanted gains that an earlier design has left."""
     found = {}
-    for job in everything:
+    for job in wanted:
         try:
             gain = parts.take(job)
         except ValueError as error:
@@ -147,11 +181,11 @@ def _keep(parts: GainParts, job: Job, gain: GainDesign, progress: Tell) -> None:
         progress(f"{job}: not kept, {parts.path(job)}: {error.strerror or error}")
 
 
-def _balance(parts: GainParts, gains: Mapping[Job, GainDesign], everything: Sequence[Job]) -> str:
+def _balance(parts: GainParts, gains: Mapping[Job, GainDesign], wanted: Sequence[Job]) -> str:
     if not gains:
         return "no artefact was written"
     return (
-        f"no artefact was written, {len(gains)} of {len(everything)} gains are kept in {parts.directory}: "
+        f"no artefact was written, {len(gains)} of {len(wanted)} gains are kept in {parts.directory}: "
         "the next `octarm design` with the same --out takes those whose data are still the same"
     )
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import msgspec
 import pytest
-from closed_form import artefact
+from closed_form import CERTIFICATE
 
 from analysis.gain_table import gain_rows, gain_table
-from wire.artefact import GainsArtefact
+from wire.artefact import Certificate
 
 GOOD = {
     "certified_gamma": 0.10,
@@ -23,17 +23,11 @@ GOOD = {
 }
 
 
-def gains(role: str = "observer", **figures: Any) -> GainsArtefact:
-    """One setpoint whose gains have good certificates, but for these figures of one of them."""
-    whole = artefact()
-    good = msgspec.structs.replace(whole.setpoints[1].observer_certificate, **GOOD)
+def gains(role: str = "observer", **figures: Any) -> list[tuple[str, str, Certificate]]:
+    """Two gains with good certificates, but for these figures of one of them."""
+    good = msgspec.structs.replace(CERTIFICATE, **GOOD)
     bad = msgspec.structs.replace(good, **figures)
-    setpoint = msgspec.structs.replace(
-        whole.setpoints[1],
-        observer_certificate=bad if role == "observer" else good,
-        controller_certificate=bad if role == "controller" else good,
-    )
-    return msgspec.structs.replace(whole, setpoints=[setpoint])
+    return [("1", name, bad if name == role else good) for name in ("observer", "controller")]
 
 
 def test_rows() -> None:

@@ -165,6 +165,24 @@ def test_json(verb: Callable[..., tuple[object, str, str]], tmp_path: Path) -> N
         (name, role) for name in "12" for role in ROLES
     ]
     assert found["gains"][0]["certified_gamma"] == 0.1414
+    assert found["parts"] is None
+
+
+def test_some_gains_only(verb: Callable[..., tuple[object, str, str]], tmp_path: Path) -> None:
+    out = tmp_path / "out.json"
+    code, shown, _ = verb("--out", out, "--only", "2:observer", "1")
+    assert code == 0
+    assert [line.split()[:2] for line in shown.splitlines()[2:5]] == [
+        ["1", "observer"],
+        ["1", "controller"],
+        ["2", "observer"],
+    ]
+    assert shown.splitlines()[-1] == f"kept in {out}.parts"
+    code, shown, _ = verb("--out", out, "--only", "1:observer", "--json")
+    found = json.loads(shown)
+    assert (found["artefact"], found["sha256"], found["parts"]) == (None, None, f"{out}.parts")
+    assert len(found["gains"]) == 1
+    assert not out.exists()
 
 
 def test_every_choice_reaches_the_design(
@@ -180,12 +198,20 @@ def test_every_choice_reaches_the_design(
     monkeypatch.setattr(designing, "run_design", refuse)
     code, out, err = octarm(
         monkeypatch, capfd, "--arm", "a.toml", "--out", "b.json", "--jobs", "3", "--solver", "SCS",
-        "--time-limit", "7", "--fresh", "--force",
+        "--time-limit", "7", "--fresh", "--force", "--only", "1", "2:observer",
     )  # fmt: skip
     assert (code, out, err) == (6, "", "working\noctarm: setpoint 1, observer: no\n")
     octarm(monkeypatch, capfd, "--arm", "mine/my.arm.toml")
     assert asked == [
-        Request(Path("a.toml"), Path("b.json"), Options("SCS", 7.0), 3, fresh=True, force=True),
+        Request(
+            Path("a.toml"),
+            Path("b.json"),
+            Options("SCS", 7.0),
+            3,
+            fresh=True,
+            force=True,
+            only=("1", "2:observer"),
+        ),
         Request(Path("mine/my.arm.toml"), Path("my.arm.gains.json")),
     ]
 

@@ -65,9 +65,10 @@ def test_what_fails_is_named_and_the_rest_is_kept_for_the_next_design(
     (damaged,) = [p for p in Path(f"{out}.parts").iterdir() if '"dies"' in p.read_text()]
     damaged.write_text("damaged")
     told.clear()
-    artefact, sha = run_design(Request(again, out, jobs=1), told.append, well)
-    assert artefact == expected(again) == read_artefact(out)
-    assert sha == digest(artefact)
+    done = run_design(Request(again, out, jobs=1), told.append, well)
+    assert done.artefact == expected(again) == read_artefact(out)
+    assert done.sha256 == digest(done.artefact)
+    assert list(done.gains) == jobs(read_arm_file(again))
     assert f"setpoint 1, observer: {damaged}: no whole part" in "\n".join(told)
     assert any(line.startswith("setpoint 2, observer: taken from ") for line in told)
     assert "setpoint 2, observer: started" not in told
@@ -154,7 +155,8 @@ def test_other_weights_of_one_role_leave_the_other_roles_gains(
         run_design(Request(path, out), work=well)
     path.write_text(arm_text("1", "2").replace("control_effort = 0.3", "control_effort = 0.4"))
     told: list[str] = []
-    artefact, _ = run_design(Request(path, out), told.append, well)
+    artefact = run_design(Request(path, out), told.append, well).artefact
+    assert artefact is not None
     assert immediate.order == ["setpoint 2, controller", "setpoint 1, controller"]
     assert artefact.weights == {"measurement_noise": 0.2, "control_effort": 0.4}
     assert f"{out}.parts: 1 part of other data, options or versions, not used" in told
@@ -171,6 +173,29 @@ def test_fresh_takes_nothing(tmp_path: Path, immediate: type[Immediate]) -> None
     path.write_text(arm_text("1"))
     run_design(Request(path, out, fresh=True), work=well)
     assert immediate.order == ["setpoint 1, controller", "setpoint 1, observer"]
+
+
+def test_some_gains_only(tmp_path: Path, immediate: type[Immediate]) -> None:
+    """They are kept for the whole design; an artefact that is there stays."""
+    path, out = arm(tmp_path, "1", "2"), tmp_path / "out.json"
+    out.write_text("mine")
+    done = run_design(Request(path, out, only=("2:controller", "1")), work=well)
+    assert [str(job) for job in done.gains] == [
+        "setpoint 1, observer",
+        "setpoint 1, controller",
+        "setpoint 2, controller",
+    ]
+    assert (done.artefact, done.sha256) == (None, None)
+    assert len(list(done.parts.iterdir())) == 3
+    assert out.read_text() == "mine"
+    told: list[str] = []
+    run_design(Request(path, out, force=True), told.append, well)
+    assert immediate.order == ["setpoint 2, observer"]
+    assert read_artefact(out) == expected(path)
+    assert not any("not used" in line for line in told)
+    for wrong in ("3", "1:", "1:both", "observer"):
+        with pytest.raises(UsageError, match=rf"--only {wrong}: .*1:observer.*2:controller"):
+            run_design(Request(path, out, only=(wrong,)), work=well)
 
 
 def test_a_refusal_leaves_everything_as_it_was(tmp_path: Path, immediate: type[Immediate]) -> None:
@@ -198,8 +223,8 @@ def test_nothing_is_written_over_what_came_meanwhile(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="exists already"):
         run_design(Request(path, out), told, well)
     assert out.read_text() == "somebody's"
-    artefact, _ = run_design(Request(path, out, force=True), work=well)
-    assert read_artefact(out) == artefact
+    done = run_design(Request(path, out, force=True), work=well)
+    assert read_artefact(out) == done.artefact
 
 
 @pytest.mark.usefixtures("immediate")
