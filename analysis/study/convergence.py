@@ -137,6 +137,7 @@ def _reference(one: Limit) -> dict[str, Any]:
         "slowest_per_s": list(one.slowest_per_s),
         "eigenvalues": [[[v.real, v.imag] for v in values] for values in one.eigenvalues],
         "own_error": one.accuracy,
+        "tip_moves_with_half_tick_mm": None if one.halved_mm is None else list(one.halved_mm),
     }
 
 
@@ -196,6 +197,13 @@ def table(facts: dict[str, Any]) -> str:
             ("observer", "controller"), one["gamma"], one["slowest_per_s"], strict=True
         ):
             lines.append(f"{name:<10} {role:<11} {gamma:>9.5f} {decay:>20.5f}")
+    for name, one in facts["references"].items():
+        if moves := one["tip_moves_with_half_tick_mm"]:
+            order = math.log2(moves[0] / moves[1])
+            lines.append(
+                f"{name:<10} tip with half the tick {moves[0]:.2g} mm off, with a quarter another "
+                f"{moves[1]:.2g} mm: order {order:.1f} in time"
+            )
     for quantity, meaning in facts["quantities"].items():
         lines += ["", f"{quantity}: {meaning}", head, "─" * (len(head) + 5 * len(counts) - 9)]
         lines += [

@@ -101,6 +101,8 @@ class Limit:
     course: SampledCourse | None
     accuracy: dict[str, float]
     """Difference to a reference of fewer polynomials, per quantity, in the unit of its errors."""
+    halved_mm: tuple[float, float] | None = None
+    """How far the tip's course moves (rms) when the tick is halved, and when it is halved again."""
 
 
 def start(arm: Arm, setpoint: Setpoint, name: str) -> InitialShape:
@@ -166,23 +168,26 @@ def limit(artefact: GainsArtefact, name: str, choices: Choices | None) -> Limit:
         accuracy[f"{role} decay"] = abs(_slowest(arm, one.A) / decay - 1.0)
     if choices is None:
         return Limit(gamma, eigenvalues, slowest, None, accuracy)
-    course, other = (
-        sampled_course(
+
+    def sampled(finer: int = 1, **size: int) -> SampledCourse:
+        return sampled_course(
             arm,
             setpoint,
-            ticks=choices.ticks,
-            tick_s=choices.tick_s,
+            ticks=finer * choices.ticks,
+            tick_s=choices.tick_s / finer,
             plant_cells=choices.plant_cells,
             initial=start(arm, setpoint, choices.initial),
             disturbance=DISTURBANCE,
             shape_at_m=_places(arm),
             **size,
         )
-        for size in ({}, {"strains": COARSER})
-    )
+
+    course, other = sampled(), sampled(strains=COARSER)
+    tips = [course.tip_m, *(sampled(finer).tip_m[::finer] for finer in (2, 4))]
+    halved = (1e3 * _rms(tips[1] - tips[0]), 1e3 * _rms(tips[2] - tips[1]))
     accuracy["tip"] = 1e3 * _rms(course.tip_m - other.tip_m)
     accuracy["estimated shape"] = 1e3 * _rms(course.estimate_m - other.estimate_m)
-    return Limit(gamma, eigenvalues, slowest, course, accuracy)
+    return Limit(gamma, eigenvalues, slowest, course, accuracy, halved)
 
 
 def _places(arm: Arm) -> Array:
