@@ -10,7 +10,7 @@ import contextlib
 import math
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -133,7 +133,7 @@ def _check_target(out: Path, force: bool) -> None:
 
 
 @contextlib.contextmanager
-def _whole(out: Path, force: bool) -> Any:
+def _whole(out: Path, force: bool) -> Iterator[Path]:
     """A file beside `out` that takes its place when all has gone well, and goes away if not."""
     try:
         handle, name = tempfile.mkstemp(dir=out.parent, prefix=f".{out.stem}-", suffix=".gif")

@@ -289,7 +289,7 @@ def draw_commands(ax: Any, recording: Recording) -> None:
     """Commands of all segments over time."""
     faces = np.asarray(recording.configuration.faces_m)
     image(ax, recording, faces, 1e3 * recording.commands, "load [mN/m]")
-    ax.set_title("Commanded transverse load")
+    ax.set_title(f"Commanded {recording.artefact.arm.actuator} load")
 
 
 def draw_curvature(ax: Any, recording: Recording) -> None:

@@ -99,7 +99,7 @@ def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
             "command",
             f"rms {_number(s['command_n_per_m']['rms'], 'mN/m', scale=1e3)}, "
             f"peak {_number(s['command_n_per_m']['peak'], 'mN/m', scale=1e3)}",
-            "transverse load per length over arm and time",
+            f"{s['actuator']} load per length over arm and time",
         ),
     ]
     out += [_gamma(s, role) for role in ("observer", "controller")]

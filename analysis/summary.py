@@ -74,6 +74,7 @@ def summary_of(recording: Recording) -> dict[str, Any]:
         "tick_s": run.tick_s,
         "scenario": run.scenario,
         "control": run.control,
+        "actuator": recording.artefact.arm.actuator,
         "setpoint": run.setpoint,
         "initial": run.initial,
         "seed": run.seed,
