@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 import launcher
 from deploy import deploy
-from supervise.plan import RunOptions
+from supervise.options import RunOptions
 from wire.artefact import read_artefact
 
 Array = npt.NDArray[np.float64]
