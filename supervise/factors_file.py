@@ -19,6 +19,8 @@ def readable(factors: NodeFactors) -> dict[str, Any]:
     """One node's factors as plain lists."""
     return {
         "index": factors.index,
+        "nodes": factors.nodes,
+        "lengths_m": factors.lengths_m.tolist(),
         "initial_estimate": factors.initial_estimate.tolist(),
         "initial_command_n_per_m": factors.initial_command.tolist(),
         "setpoints": [
@@ -51,16 +53,23 @@ def message_bytes(numbers: int, tick: int = 1000, node: int = 50) -> int:
 
 def facts(deployment: Deployment) -> dict[str, Any]:
     """The table of `octarm deploy`."""
+    # every setpoint's sums travel in messages of one length, with what the scheduling needs behind them
+    lengths = [
+        length
+        for node in deployment.nodes
+        for length in (node.forward_received, node.backward_received)
+        if length
+    ]
+    size = [message_bytes(min(lengths)), message_bytes(max(lengths))]
     rows = []
     for i, name in enumerate(deployment.setpoint_names):
         forward, backward = deployment.ranks_forward[i], deployment.ranks_backward[i]
-        both = (*forward, *backward)
         rows.append(
             {
                 "name": name,
                 "rank_forward": max(forward),
                 "rank_backward": max(backward),
-                "bytes_per_message": [message_bytes(min(both)), message_bytes(max(both))],
+                "bytes_per_message": size,
                 "spectral_radius": deployment.spectral_radius[i].largest,
             }
         )
