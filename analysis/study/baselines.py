@@ -86,10 +86,11 @@ def _row(
 ) -> dict[str, Any]:
     """One feedback at one setpoint; runs in a process of its own.
 
-    "gamma", "fine_gamma": of the state feedback, `state_norm`; "loop_gamma": of the whole sampled loop around
-    the exact arm, `loop_channel`; "decay_per_s", "settling_s", "tip_error_m", "rest_error_m", "stable", "why":
-    as in the study of robustness; "rms_n_per_m", "peak_n_per_m": of the command beyond the holding load;
-    "messages", "feedback_messages", "numbers"; "tip_course_mm": about 300 samples over the run.
+    "gamma", "fine_gamma": of the state feedback if it is one ("of_state"), None if infinite, `state_norm`;
+    "loop_gamma": of the whole sampled loop around the exact arm, `loop_channel`; "decay_per_s", "settling_s",
+    "tip_error_m", "rest_error_m", "stable", "why": as in the study of robustness; "rms_n_per_m",
+    "peak_n_per_m": of the command beyond the holding load; "messages", "feedback_messages", "numbers";
+    "tip_course_mm": about 300 samples over the run.
     """
     deployment = deploy(artefact, nodes, tick_s)
     setpoint = artefact.setpoints[artefact.setpoint_index(name)]
@@ -122,6 +123,7 @@ def _row(
     return {
         "setpoint": name,
         "feedback": one.name,
+        "of_state": one.gain is not None,
         "gamma": gamma,
         "fine_gamma": fine_gamma,
         "loop_gamma": loop_gamma,
@@ -167,6 +169,11 @@ def _line(cells: Sequence[str]) -> str:
     return " ".join(f"{cell:{form}}" for cell, form in zip(cells, forms, strict=True)).rstrip()
 
 
+def _norm(row: dict[str, Any], key: str) -> str:
+    """Of a state feedback that is not stable the norm is infinite; other rows have none."""
+    return "inf" if row["of_state"] and row[key] is None else number(row[key], ".4f")
+
+
 def table(facts: dict[str, Any]) -> str:
     """One line a feedback; below, what the columns are and why unstable rows are."""
     lines = [_line([column[k] for column in _COLUMNS]) for k in (0, 1)]
@@ -182,8 +189,7 @@ def table(facts: dict[str, Any]) -> str:
                     row["setpoint"],
                     row["feedback"],
                     "yes" if row["stable"] else "no",
-                    number(row["gamma"], ".4f"),
-                    number(row["fine_gamma"], ".4f"),
+                    *(_norm(row, key) for key in ("gamma", "fine_gamma")),
                     number(row["loop_gamma"], ".4f"),
                     number(row["settling_s"], ".1f"),
                     number(row["tip_error_m"], ".2f", 1e3),

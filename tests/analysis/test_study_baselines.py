@@ -166,5 +166,8 @@ def test_the_comparison_from_gains_to_table(
     line = next(line for line in text.splitlines() if "dense, slycot" in line)
     assert f"{dense['gamma']:.4f}" in line
     assert line.split()[-2:] == ["10", "4"]
+    unstable = {**facts, "rows": [{**dense, "gamma": None}, {**idle, "setpoint": "bent"}]}
+    shown = baselines.table(unstable).splitlines()[3:5]
+    assert [line.split()[4] for line in shown] == ["inf", "-"]
     baselines.plot(facts, tmp_path / "curves.png")
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
