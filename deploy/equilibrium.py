@@ -101,15 +101,20 @@ def inertia_load(arm: Arm, curvature_per_m: Array, acceleration_m_per_s2: Array)
 
         N.n = -X sin theta + N_y cos theta   gives   f = f_rest + rho A a_y - (X tan theta)'.
 
-    Along the normal it is rho A n.a, to first order.
+    A load along n leaves a force T along t only, T' = rho A a.t and T(L) = 0, so
+    f = f_rest + rho A a.n - theta' T.
     """
     basis, half = _basis(), 0.5 * arm.length_m
     mass = arm.mass_per_length_kg_per_m
     along, across = acceleration_m_per_s2
     angle = angle_at_points(arm, series_of(curvature_per_m))
     if arm.actuator == "normal":
-        part = np.cos(angle) * (basis.values @ across) - np.sin(angle) * (basis.values @ along)
-        return np.asarray(basis.fit @ (mass * part))
+        x, y = basis.values @ along, basis.values @ across
+        so_far = basis.integral @ (basis.fit @ (np.cos(angle) * x + np.sin(angle) * y)) * half
+        pull = mass * (basis.values @ so_far - np.sum(so_far))
+        bend = basis.values @ series_of(curvature_per_m)
+        part = mass * (np.cos(angle) * y - np.sin(angle) * x)
+        return np.asarray(basis.fit @ (part - bend * pull))
     so_far = basis.integral @ along
     beyond = np.sum(so_far) - basis.values @ so_far  # every Legendre function is 1 at the tip
     lifted = basis.fit @ (mass * half * beyond * np.tan(angle))

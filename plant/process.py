@@ -246,8 +246,8 @@ class PlantProcess:
             return None
         names = self._run.setpoint_names
         text = (
-            f"tick {k}: {_nodes(other)} go on with another setpoint than node 0 "
-            f"({names[self._said[other[0]]]} and {names[self._setpoint]})"
+            f"tick {k}: {_nodes(other)}: the next setpoint is {names[self._said[other[0]]]}, but "
+            f"{names[self._setpoint]} for node 0"
         )
         return Stop(k, "safety", text)
 

@@ -40,23 +40,27 @@ def test_the_load_holds_the_shape(arm: Arm) -> None:
     np.testing.assert_allclose(by_shooting[:, 3], bend, atol=1e-9)
 
 
-def test_an_arm_that_accelerates_keeps_its_shape_under_the_load_for_it() -> None:
-    """With the inertia as a load of its own, in x and y: the bending moment is that of rest."""
+@pytest.mark.parametrize("arm", [ARM, NORMAL], ids=["transverse", "normal"])
+def test_an_arm_that_accelerates_keeps_its_shape_under_the_load_for_it(arm: Arm) -> None:
+    """N' = rho A a - f b beyond that at rest, by the trapezoidal rule: no part of N along n, so no bending."""
     acceleration = np.zeros((2, 96))
     acceleration[:, :4] = [[0.02, 0.03, 0.01, -0.004], [-0.03, 0.02, 0.01, 0.005]]
-    extra = inertia_load(ARM, np.array(SETPOINT_2), acceleration)
-    mass, s = ARM.mass_per_length_kg_per_m, np.linspace(0.0, 1.0, 4001)
+    extra = inertia_load(arm, np.array(SETPOINT_2), acceleration)
+    mass, s = arm.mass_per_length_kg_per_m, np.linspace(0.0, 1.0, 4001)
     angle = legendre.legval(2.0 * s - 1.0, legendre.legint(np.array(SETPOINT_2), lbnd=-1.0) * 0.5)
     ax, ay = (legendre.legval(2.0 * s - 1.0, one) for one in acceleration)
-    force = legendre.legval(2.0 * s - 1.0, extra)
+    load = legendre.legval(2.0 * s - 1.0, extra)
+    turned = 0.0 * angle if arm.actuator == "transverse" else angle
 
     def beyond(f: npt.ArrayLike) -> Array:
         f = np.asarray(f, dtype=np.float64)
         pieces = 0.5 * (f[1:] + f[:-1]) * np.diff(s)
         return np.append(np.cumsum(pieces[::-1])[::-1], 0.0)
 
-    across: Array = -np.sin(angle) * beyond(-mass * ax) + np.cos(angle) * beyond(force - mass * ay)
-    size = float(np.max(np.abs(beyond(force))))
+    nx = beyond(-load * np.sin(turned) - mass * ax)
+    ny = beyond(load * np.cos(turned) - mass * ay)
+    across: Array = -np.sin(angle) * nx + np.cos(angle) * ny
+    size = float(np.max(np.abs(beyond(load))))
     assert size > 1e-3
     np.testing.assert_allclose(across, 0.0, atol=1e-6 * size)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,12 +11,16 @@ import pytest
 
 from analysis.central import compare_with_central
 from analysis.recording import read_recording
+from plant.process import PlantProcess
+from supervise.endpoints import choose
 from supervise.options import RunOptions
-from supervise.plan import prepare, scheduling
-from supervise.scenario import Course, read_scenario, settle
+from supervise.plan import make_plan, prepare, scheduling
+from supervise.scenario import read_scenario, settle
 from supervise.shipped import SCENARIOS
 from wire.channels import SCHEDULE
+from wire.child import Child
 from wire.errors import UsageError
+from wire.run_config import LegConfig
 
 if TYPE_CHECKING:
     from conftest import Start
@@ -172,17 +177,10 @@ def test_sectors_lie_midway_between_the_tips_that_are_visited(gains: Path) -> No
     alone = scheduling(prepared.artefact, prepared.course)
     assert (alone.setpoints, alone.boundaries_deg) == ((1,), ())
     x, y = prepared.artefact.setpoints[1].tip_m
-    both = scheduling(prepared.artefact, _visiting(prepared.course))
+    there = replace(prepared.course, legs=(LegConfig("straight", (), 1.0, 0.0),))
+    both = scheduling(prepared.artefact, there)
     assert both.setpoints == (0, 1)
     assert both.boundaries_deg[0] == pytest.approx(0.5 * np.degrees(np.arctan2(y, x)))
-
-
-def _visiting(course: Course) -> Course:
-    from dataclasses import replace
-
-    from wire.run_config import LegConfig
-
-    return replace(course, legs=(LegConfig("straight", (), 1.0, 0.0),))
 
 
 def test_a_run_changes_gains_at_one_tick_in_every_node(start: Start, tmp_path: Path) -> None:
@@ -243,3 +241,25 @@ def test_without_control_the_commands_are_the_holding_load(start: Start) -> None
     assert cli.json()["max_difference_to_central"] <= 1e-12
     error = cli.json()["estimation_error"]
     assert error["final"] < error["initial"]
+
+
+def test_nodes_that_go_on_with_different_setpoints_stop_the_arm(
+    gains: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "there.toml"
+    path.write_text(GOOD)
+    prepared = prepare(RunOptions(gains=gains, scenario=str(path), nodes=3))
+    endpoints = choose(3, "unix", None, tmp_path / "s")
+    try:
+        plan = make_plan(prepared, endpoints, "a run", tmp_path)
+    finally:
+        endpoints.close()
+    plant = PlantProcess(plan.plant, Child("plant", control=-1, status=-1, directory=None))
+    assert plant._agreed(4) is None
+    plant._said = [1, 1, 1]
+    assert plant._agreed(5) is None
+    plant._said = [1, 0, 1]
+    stop = plant._agreed(6)
+    assert stop is not None
+    assert (stop.tick, stop.cause) == (6, "safety")
+    assert stop.text == "tick 6: node 1: the next setpoint is straight, but 1 for node 0"
