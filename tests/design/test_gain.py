@@ -158,17 +158,16 @@ def test_a_shape_that_no_load_holds(straight: ArmFile) -> None:
 # The shipped artefact
 
 
-@pytest.fixture(scope="module")
-def again(shipped: GainsArtefact) -> GainDesign:
-    """The observer of setpoint 1, designed from the example's arm file."""
+def test_a_shipped_gain_is_reproduced(shipped: GainsArtefact) -> None:
+    """The observer of setpoint 1 from the example's arm file: its figures and the matrix that segments run.
+
+    Another processor's linear algebra moves that matrix by up to 1e-4.
+    """
     file = read_arm_file(ROOT / "examples" / "chapter_arm.toml")
     assert (file.arm(), file.setpoints[0].name) == (shipped.arm, "1")
-    return design_gain(file, 0, "observer", Options())
-
-
-def test_shipped_figures_are_reproduced(again: GainDesign, shipped: GainsArtefact) -> None:
-    got = again.certificate
-    expected = shipped.setpoints[shipped.setpoint_index("1")].observer_certificate
+    again = design_gain(file, 0, "observer", Options())
+    setpoint = shipped.setpoints[shipped.setpoint_index("1")]
+    got, expected = again.certificate, setpoint.observer_certificate
     for key in ("certified_gamma", "achieved_gamma", "open_loop_gamma", "optimum_gamma"):
         assert getattr(got, key) == pytest.approx(getattr(expected, key), rel=1e-3), key
     assert got.decay_per_s == pytest.approx(expected.decay_per_s, rel=1e-2)
@@ -176,17 +175,13 @@ def test_shipped_figures_are_reproduced(again: GainDesign, shipped: GainsArtefac
     assert got.gram_sizes == expected.gram_sizes
     assert got.equalities == expected.equalities
 
-
-def test_shipped_gains_are_reproduced(again: GainDesign, shipped: GainsArtefact) -> None:
-    """The matrix that segments run. Another processor's linear algebra moves it by up to 1e-4."""
     grid = make_grid(shipped.arm.length_m, 20, "equispaced")
-    setpoint = shipped.setpoints[shipped.setpoint_index("1")]
     redesigned = msgspec.structs.replace(setpoint, observer=again.factors)
     new, old = (make_loop(shipped.arm, s, grid) for s in (redesigned, setpoint))
     assert np.linalg.norm(new.L - old.L) <= 2e-3 * np.linalg.norm(old.L)
     for sums in ("n1b", "n2b"):
-        got, expected = getattr(again.factors, sums), getattr(setpoint.observer, sums)
-        assert len(got.coefficients) == len(expected.coefficients)
+        ours, theirs = getattr(again.factors, sums), getattr(setpoint.observer, sums)
+        assert len(ours.coefficients) == len(theirs.coefficients)
 
 
 def test_shipped_equilibria_are_reproduced(shipped: GainsArtefact) -> None:
