@@ -54,6 +54,7 @@ def controller_problem(pie: ArmPIE, effort: float, actuator: str = ACTUATORS[0])
         C1=functional("v_y"),
         C2=pie.command(actuator),
         rho=effort,
+        multiples=max(0, min(2, pie.normal.shape[1] - 2)) if actuator == "normal" else 0,
         rates=pie.strain_rates if pie.retardation > 0.0 else None,
     )
 

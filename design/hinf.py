@@ -44,7 +44,9 @@ class HinfProblem:
 
     T, A: f -> x and f -> x_t; krylov: x -> A^-1 x; B: R^w -> x; C1: x -> R^z; C2: x -> outputs;
     rho: weight of the noise on the fed-back output; rates: functions of f that the dynamics dissipate
-    and that are no functions of x (Kelvin-Voigt damping), None if there are none.
+    and that are no functions of x (Kelvin-Voigt damping), None if there are none; multiples: largest degree
+    of the polynomials that multiply z and the velocities in the inequality, above 0 where the coefficients
+    of C2 vary along s: z is then seen through C2 only by weights that vary as well.
     """
 
     T: PIOperator
@@ -55,6 +57,7 @@ class HinfProblem:
     C2: PIOperator
     rho: float
     rates: PIOperator | None = None
+    multiples: int = 0
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,13 @@ class _Rows:
             *(unit_rows(r) for r in ladder[:-1]),
             unit_rows(ladder[-1].rows([], half) if level else state),
         )
+        more: list[PIOperator] = []
+        if problem.multiples:
+            self.gain = vertical(self.gain, unit_rows(problem.C2))
+            velocity = signals.x.rows([], half)
+            weights = np.eye(problem.multiples + 1)
+            for j in range(1, problem.multiples + 1):
+                more += [weighted(row, weights[j, : j + 1]) for row in (signals.z, velocity)]
         columns = [c for p in profiles for row in p.q2 for c in row if np.any(c)]
         integrals = PIOperator.zeros(Shape(n, 0), Shape(0, n)).replace(q1=np.eye(n)[:, :, None])
         self.inequality = vertical(
@@ -134,6 +144,7 @@ class _Rows:
             lifted(integrals @ signals.x),
             self.gain @ signals.x,
             *(() if signals.rates is None else (signals.rates,)),
+            *more,
             signals.noise,
         )
 
