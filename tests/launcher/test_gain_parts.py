@@ -117,11 +117,10 @@ def test_a_part_belongs_to_the_programs_that_made_it(
     shutil.copytree(design.__path__[0], copy)
     monkeypatch.setattr(design, "__path__", [str(copy)])
     before = code_digest.__wrapped__()
-    assert before == code_digest()
     for name in ("hinf.py", "lpi/rows.py"):
         file = copy / name
         file.write_text(file.read_text() + "\n")
-        assert code_digest.__wrapped__() not in (before, code_digest())
+        assert code_digest.__wrapped__() != before
         file.write_text(file.read_text()[:-1])
     assert code_digest.__wrapped__() == before
 
