@@ -2,7 +2,7 @@
 
 Segment i (0 .. n-1 in code) is the cell [faces[i], faces[i+1]]. Its node holds a velocity at the
 outer face faces[i+1], an axial strain at the cell's centre and a curvature at the inner face
-faces[i]; it measures v_y and k at these places and commands a transverse load at the outer face
+faces[i]; it measures v_y and k at these places and commands a load at the outer face
 (theory, section 5: staggered grid).
 """
 
@@ -51,7 +51,7 @@ MEASUREMENT_PLACES = (Place.OUTER_FACE, Place.INNER_FACE)
 MEASURED_STATES = [1, 3]
 """Which components of the state are measured."""
 COMMAND_PLACES = (Place.OUTER_FACE,)
-"""Place of a node's command, a transverse load in N/m."""
+"""Place of a node's command, a load in N/m (`Arm.actuator`)."""
 
 
 @dataclass(frozen=True, eq=False)
