@@ -30,7 +30,7 @@ from design.hinf import (
 from design.inverse import solve_gain
 from design.setpoint_entry import setpoint_entry
 from design.verify import GRIDS, Achieved, verify_controller, verify_observer
-from wire.artefact import Arm, Certificate, OperatorFactors
+from wire.artefact import Arm, Certificate, OperatorFactors, check_gain
 from wire.errors import GainsRefusedError
 
 LEVEL = 2
@@ -103,6 +103,7 @@ def design_gain(
     open_loop_decay = _open_loop_decay(arm, entry.curvature_per_m)
     seconds = time.perf_counter() - start
     certificate = _certificate(gain, achieved, open_loop_decay, options, seconds)
+    check_gain(factors, certificate, role, f"setpoint {setpoint.name}")
     tell(
         f"certified {certificate.certified_gamma:.4f}, achieved {achieved.gamma:.4f}, "
         f"optimum {achieved.optimum_gamma:.4f}, open loop {achieved.open_loop_gamma:.3f}, "
@@ -150,6 +151,12 @@ def _check_achieved(result: HinfResult, achieved: Achieved, name: str) -> None:
         raise GainsRefusedError(
             f"{name}: on finite differences the closed loop has norm {achieved.gamma:.4f} and "
             f"decay {achieved.decay_per_s:.3g}/s, the LPI certified {result.gamma:.4f}; the gain is refused"
+        )
+    if not np.isfinite([achieved.open_loop_gamma, achieved.optimum_gamma]).all():
+        raise GainsRefusedError(
+            f"{name}: on finite differences the open loop has norm {achieved.open_loop_gamma:.4g} and the best "
+            f"of all gains {achieved.optimum_gamma:.4g}, so there is nothing to compare the gain with; it is "
+            "refused. Try more moderate weights or more damping"
         )
 
 

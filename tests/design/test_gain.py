@@ -91,6 +91,8 @@ def test_a_job_gives_a_gain_that_can_be_sent_and_kept(
         ({"gamma": 0.17}, "the closed loop has norm 0.1700 and decay 0.01/s"),
         ({"gamma": float("nan")}, "norm nan"),
         ({"decay_per_s": 0.0}, "norm 0.1000 and decay 0/s"),
+        ({"optimum_gamma": float("inf")}, "the best of all gains inf"),
+        ({"open_loop_gamma": float("inf")}, "the open loop has norm inf"),
     ],
     ids=str,
 )
