@@ -25,6 +25,7 @@ from design.channel import riccati_optimum
 from design.verify import ArmMatrices, arm_matrices, controller_channel, measured_rows
 from wire.artefact import Arm, GainsArtefact, Setpoint
 from wire.errors import OctarmError
+from wire.factors import BACKWARD_EXTRA, FORWARD_EXTRA
 
 Array = npt.NDArray[np.float64]
 
@@ -48,7 +49,7 @@ class Feedback:
     feedback_messages: int
     """Of these for the feedback; ours travels with the observer's."""
     numbers: str
-    """In a message."""
+    """In a message of the feedback, where two are given forward and backward; ours has the observer's in it."""
 
 
 def make_feedbacks(
@@ -81,7 +82,8 @@ def make_feedbacks(
     state_scale, command_scale, output_scale = scales(loop, matrices, arm)
     dense = gains.K * state_scale / command_scale[:, None]
     observer, all_pairs = 2 * (n - 1), n * (n - 1)
-    most = max(*deployment.ranks_forward[index], *deployment.ranks_backward[index])
+    forward = max(deployment.ranks_forward[index]) + FORWARD_EXTRA
+    backward = max(deployment.ranks_backward[index]) + BACKWARD_EXTRA
 
     def sampled(gain: Array, *, band: bool) -> DenseStep:
         matrix = sampled_gain(loop, gain, deployment.tick_s)
@@ -92,7 +94,7 @@ def make_feedbacks(
         optimum,
         gains.gamma,
         [
-            Feedback("ours", ours, loop.K, observer, 0, f"{most}"),
+            Feedback("ours", ours, loop.K, observer, 0, f"{forward}/{backward}"),
             Feedback(
                 "ours, truncated",
                 sampled(loop.K, band=True),

@@ -18,7 +18,7 @@ from deploy import DenseStep, Deployment, Place, SegmentGrid
 from deploy.arm import make_arm_modes, sample
 from design.arm_file import time_unit_s
 from design.channel import Channel
-from plant.disturbance import DisturbanceSpec
+from plant.disturbance import NO_DISTURBANCE, DisturbanceSpec
 from plant.initial import initial_shape
 from plant.model import ArmPlant, PlantParameters
 from wire.artefact import Arm, GainsArtefact, Setpoint
@@ -86,8 +86,12 @@ class Rest:
 def exact_arm(parameters: PlantParameters, state: Array, command: Array) -> SampledArm:
     """Differentiate one tick of the exact plant at a state (m,) under a command (n,)."""
     quiet, up, down = (
-        ArmPlant(dataclasses.replace(parameters, disturbance=DisturbanceSpec("step", amplitude)))
-        for amplitude in (0.0, LOAD_STEP, -LOAD_STEP)
+        ArmPlant(dataclasses.replace(parameters, disturbance=disturbance))
+        for disturbance in (
+            NO_DISTURBANCE,
+            DisturbanceSpec("step", LOAD_STEP),
+            DisturbanceSpec("step", -LOAD_STEP),
+        )
     )
 
     def seen(x: Array) -> Array:
