@@ -23,7 +23,7 @@ import numpy.typing as npt
 from numpy.polynomial import legendre
 from scipy.linalg import lapack
 
-from deploy.equilibrium import SIZE, Equilibrium
+from deploy.equilibrium import SIZE, Equilibrium, equilibrium
 from deploy.feedforward import holding, profiles, projection
 from deploy.grid import Place, SegmentGrid
 from deploy.model import tangent_angle
@@ -44,6 +44,11 @@ CONVERGED = 1e-9
 SMALLEST_N_PER_M = 1e-12
 WEAKEST = 1e-5
 """Loads that turn the arm less than this share of the most effective one keep their first values."""
+
+FAR_RAD = math.radians(15.0)
+"""A shape whose angle is off by more somewhere is another one (two segments hold setpoint 3 to 11 degrees)."""
+PARTS = 4
+"""Shapes on the way to one that is not found at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +88,9 @@ class Holder:
         """
         grid = self._grid
         if self._statics is not None:
-            first = self.commands(rest.load_n_per_m)
-            held = self._statics.hold(curvature_per_m, first, near)
+            held = self._statics.hold(curvature_per_m, self.commands(rest.load_n_per_m), near)
+            if held is None or self._statics.misfit_rad(held, curvature_per_m) > FAR_RAD:
+                held = self._bent_in_parts(curvature_per_m, what)
             if held is None:
                 raise UsageError(
                     f"{what}: {grid.nodes} segments hold no shape like it; use more nodes, or a curvature "
@@ -102,6 +108,20 @@ class Holder:
             curvature_per_m=_at(inner, curvature_per_m) + found.curvature_change_per_m,
             position_m=np.stack([_at(outer, one) for one in rest.position_m]),
         )
+
+    def _bent_in_parts(self, curvature_per_m: Array, what: str) -> Held | None:
+        """The same by way of less bent shapes: few segments need it, whose first commands hold another shape
+        than the one that is wanted; None if that does not help."""
+        if self._statics is None:
+            return None
+        held: Held | None = None
+        for part in np.arange(1, PARTS + 1) / PARTS:
+            curvature = part * curvature_per_m
+            load = equilibrium(self._arm, curvature, what).load_n_per_m
+            held = self._statics.hold(curvature, self.commands(load), held)
+            if held is None or self._statics.misfit_rad(held, curvature) > FAR_RAD:
+                return None
+        return held
 
     def commands(self, load_n_per_m: Array) -> Array:
         """L2 projection (n,) of a load, a series of `SIZE` coefficients."""
@@ -182,6 +202,13 @@ class _Statics:
             if np.max(np.abs(change)) <= CONVERGED * np.max(np.abs(command)) + SMALLEST_N_PER_M:
                 break
         return self._held(command, first_n_per_m, shape)
+
+    def misfit_rad(self, held: Held, curvature_per_m: Array) -> float:
+        """How far the held shape's angle is from that of the wanted curvature, at the worst place."""
+        if held.angle_rad is None:
+            return math.inf
+        wanted = tangent_angle(curvature_per_m, self.centres_m, self._arm.length_m)
+        return float(np.max(np.abs(held.angle_rad - wanted)))
 
     def _shape(self, command: Array, angle: Array) -> _Shape | None:
         """The shape under commands, None if Newton's method does not find it from this angle (CELLS,)."""

@@ -91,12 +91,34 @@ def test_a_straight_arm_is_held_by_nothing() -> None:
         np.testing.assert_allclose(values, 0.0, atol=1e-15)
 
 
-def test_a_shape_with_a_moment_at_its_tip_is_refused() -> None:
+def farthest_degrees(held: Held, series: Array, length_m: float) -> float:
+    assert held.angle_rad is not None
+    angle = legendre.legint(series, lbnd=-1.0) * 0.5 * length_m
+    wanted = legendre.legval(2.0 * (np.arange(CELLS) + 0.5) / CELLS - 1.0, angle)
+    return float(np.degrees(np.max(np.abs(held.angle_rad - wanted))))
+
+
+@pytest.mark.parametrize("spacing", ["chebyshev", [0.0, 0.05, 0.15, 0.4, 0.7, 1.0]])
+def test_few_segments_hold_a_strongly_bent_shape_by_way_of_others(
+    spacing: str | list[float],
+) -> None:
+    """From the projected load the search finds another shape here, or none."""
+    held = hold(SETPOINT_3, make_grid(1.0, 5, spacing))
+    assert farthest_degrees(held, np.array(SETPOINT_3), 1.0) < 3.0
+    assert np.max(np.abs(held.command_n_per_m)) < 4.0
+
+
+def test_a_moment_at_the_tip_is_made_by_the_outer_segments() -> None:
     series = np.array([0.9, -1.3, 0.5, 0.1, -0.2])
     arm = msgspec.structs.replace(ARM, length_m=1.25)
     rest_of_it = equilibrium(arm, series, "s")
-    with pytest.raises(UsageError, match="s: 4 segments hold no shape like it"):
-        Holder(arm, make_grid(1.25, 4, "equispaced")).hold(series, rest_of_it, "s")
+    held = Holder(arm, make_grid(1.25, 4, "equispaced")).hold(series, rest_of_it, "s")
+    assert farthest_degrees(held, series, 1.25) < 1.0
+
+
+def test_a_shape_that_the_segments_cannot_hold_is_refused() -> None:
+    with pytest.raises(UsageError, match="s: 2 segments hold no shape like it"):
+        hold([0.0, 0.0, 0.0, 8.0], make_grid(1.0, 2, "equispaced"))
 
 
 def test_projected_commands_are_where_the_search_starts() -> None:
