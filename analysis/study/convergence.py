@@ -268,4 +268,4 @@ def plot(facts: dict[str, Any], path: Path) -> None:
     ]
     handles.append(Line2D([], [], color="0.6", linewidth=4.0, alpha=0.5, label=f"order {ORDER}"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=80)
