@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from analysis.metrics import energy_norm
 from analysis.recording import QUANTITIES, Recording
-from analysis.shape_error import face_positions
+from deploy import Place, SegmentGrid
 from node.scheduling import ArmEnd, Sectors
 from wire.errors import UsageError
 
@@ -80,7 +80,8 @@ class CentralRun:
 
 def central_run(recording: Recording, ticks: int) -> CentralRun:
     """Run the dense steps over the recorded measurements for so many ticks."""
-    run, faces = recording.configuration, np.asarray(recording.configuration.faces_m)
+    run = recording.configuration
+    bends = SegmentGrid(np.asarray(run.faces_m)).dual_widths_m(Place.INNER_FACE)
     steps, references = recording.deployment.dense, recording.references
     sectors = Sectors.of(run.scheduling)
     fade = math.exp(-run.tick_s / run.scheduling.bump_s)
@@ -100,11 +101,22 @@ def central_run(recording: Recording, ticks: int) -> CentralRun:
         bump = jump if changed else bump * fade
         following[:, 4] += bump
         # What the tip node announces in this tick, it has decided by the estimate of the tick before.
-        tip = face_positions(state[:, :4], faces)[-1]
+        tip = _tip(state, now, references.chords_m(k), bends)
         changed, active = announced != active, announced
         announced = sectors.choose(announced, ArmEnd(0.0, *tip.tolist()))
         state, now = following, then
     return CentralRun(out[:, :, :4], out[:, :, 4], setpoints, bumps)
+
+
+def _tip(state: Array, wanted: Array, chords: Array, bends: Array) -> Array:
+    """Estimated tip (2,): the chords (n, 2) of the reference, turned and stretched by the deviations from it.
+
+    state, wanted: (n, 5); bends: (n,), what each curvature bends.
+    """
+    turns = np.cumsum((state[:, 3] - wanted[:, 3]) * bends)
+    stretch = (1.0 + state[:, 2]) / (1.0 + wanted[:, 2])
+    places = np.sum(stretch * np.exp(1j * turns) * (chords[:, 0] + 1j * chords[:, 1]))
+    return np.array([places.real, places.imag])
 
 
 def compare_with_central(recording: Recording, tolerance: float = 1e-12) -> CentralComparison:

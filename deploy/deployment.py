@@ -247,11 +247,10 @@ def _in_si(
 
 def _node(index: int, factors: Sequence[SweepFactors], grid: SegmentGrid) -> NodeFactors:
     start = np.stack([one.out_offset for one in factors])
-    lengths = [grid.cell_widths_m[index], grid.dual_widths_m(Place.INNER_FACE)[index]]
     return NodeFactors(
         index=index,
         nodes=grid.nodes,
-        lengths_m=np.array(lengths),
+        bend_m=float(grid.dual_widths_m(Place.INNER_FACE)[index]),
         initial_estimate=start[:, :STATES].copy(),
         initial_command=start[:, STATES].copy(),
         setpoints=tuple(_padded(factors)),

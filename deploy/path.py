@@ -25,6 +25,7 @@ from deploy.equilibrium import SIZE, Equilibrium, equilibrium, inertia_load, ser
 from deploy.grid import SegmentGrid
 from deploy.held import Held, Holder
 from wire.artefact import Arm, GainsArtefact
+from wire.channels import COMMAND, STATE
 from wire.errors import OctarmError
 from wire.reference import TERMS, Leg, Reference
 from wire.run_config import LegConfig
@@ -35,8 +36,9 @@ DEGREES = (12, 24, 48)
 """Degrees in sigma to try."""
 RESOLVED = 1e-7
 """The last coefficients of every quantity are below this share of its largest."""
-NODE = ("velocity_x_m_per_s", "velocity_y_m_per_s", "strain", "curvature_per_m", "force_n_per_m")
-"""Quantities of a node's reference, at the places of its state and command."""
+NODE = (*STATE, *COMMAND, "chord_x_m", "chord_y_m")
+"""Quantities of a node's reference: at the places of its state and command, and from inner to outer face."""
+HELD = len(STATE)
 PLANT = ("tip_x_m", "tip_y_m", "mean_velocity_y_m_per_s", "mean_curvature_per_m")
 """Quantities of the plant's reference."""
 
@@ -50,7 +52,11 @@ class References:
 
     def states(self, tick: int) -> Array:
         """(n, 5): state and command that all nodes should have at a tick."""
-        return np.stack([one.at(tick) for one in self.nodes])
+        return np.stack([one.at(tick)[: HELD + 1] for one in self.nodes])
+
+    def chords_m(self, tick: int) -> Array:
+        """(n, 2): from inner to outer face of every segment at a tick."""
+        return np.stack([one.at(tick)[HELD + 1 :] for one in self.nodes])
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +136,7 @@ def make_references(
         here = leg.to
     return References(
         nodes=tuple(
-            Reference(tick_s, [Leg(t, m, nodes[i]) for t, m, nodes, _ in moves], held=1)
+            Reference(tick_s, [Leg(t, m, nodes[i]) for t, m, nodes, _ in moves], held=HELD)
             for i in range(grid.nodes)
         ),
         plant=Reference(tick_s, [Leg(t, m, plant) for t, m, _, plant in moves]),
@@ -140,7 +146,7 @@ def make_references(
 def _table(
     artefact: GainsArtefact, grid: SegmentGrid, holder: Holder, names: Sequence[str]
 ) -> tuple[Array, Array]:
-    """Coefficients of the nodes (n, 4, 5, degree + 1) and of the plant (4, 4, degree + 1) on one leg."""
+    """Coefficients of the nodes (n, 4, 7, degree + 1) and of the plant (4, 4, degree + 1) on one leg."""
     arm, path = artefact.arm, curvature_path(artefact, names)
     if len(names) == 1:
         found = _sample(arm, grid, holder, path, np.zeros(1), names)
@@ -237,13 +243,15 @@ def _by_sigma(series: Array) -> Array:
 
 
 def _coefficients(arm: Arm, grid: SegmentGrid, found: _Samples, degree: int) -> tuple[Array, Array]:
-    """Coefficients of all nodes (n, 4, 5, degree + 1) and of the plant (4, 4, degree + 1)."""
+    """Coefficients of all nodes (n, 4, 7, degree + 1) and of the plant (4, 4, degree + 1)."""
     rates = _by_sigma(_series(found.position, degree))  # (degree + 1, 2, n)
     push = _series(found.push, degree)
     nodes = np.zeros((grid.nodes, TERMS, len(NODE), degree + 1))
     nodes[:, 0, 2] = _series(found.strain, degree).T
     nodes[:, 0, 3] = _series(found.curvature, degree).T
     nodes[:, 0, 4] = _series(found.holding, degree).T
+    chords = np.diff(found.position, axis=2, prepend=0.0)
+    nodes[:, 0, 5:] = _series(chords, degree).transpose(2, 1, 0)
     nodes[:, 1, :2] = rates.transpose(2, 1, 0)
     # Kelvin-Voigt damping resists as a shape does that goes ahead by its time: exact for small bends
     viscous = arm.kelvin_voigt_s * _by_sigma(_series(found.holding, degree))

@@ -1,8 +1,9 @@
 """Which setpoint's gains are in use: the tip node's decision from the tip's estimated place (pure mathematics).
 
 Between the sums, which bring the estimated arm's shape to the tip node and its decision to all others, and
-`node.sweep`, which takes the gains (theory, section 5). The shape comes as angle and position of the arm so
-far: every node adds its own segment.
+`node.sweep`, which takes the gains (theory, section 5). The shape comes as turn and end of the arm so far:
+every node adds its own segment, turned and stretched from what the reference says it is. So the grid's own
+error, which few segments have much of, is not taken for a displacement.
 """
 
 from __future__ import annotations
@@ -16,25 +17,25 @@ from wire.run_config import SchedulingConfig
 
 
 class ArmEnd(NamedTuple):
-    """Where the estimated arm ends so far: angle of the last segment, x and y of its outer face."""
+    """Where the estimated arm ends so far: its turn from the reference there, x and y of the outer face."""
 
-    angle_rad: float
+    turn_rad: float
     x_m: float
     y_m: float
 
-    def grown(
-        self, strain: float, curvature_per_m: float, segment_m: float, bend_m: float
-    ) -> ArmEnd:
-        """With one segment more; its curvature turns the arm over bend_m, it is straight and stretched."""
-        angle = self.angle_rad + curvature_per_m * bend_m
-        length = (1.0 + strain) * segment_m
+    def grown(self, turn_rad: float, stretch: float, chord_x_m: float, chord_y_m: float) -> ArmEnd:
+        """With one segment more: the reference's chord, turned by turn_rad more and stretched."""
+        turn = self.turn_rad + turn_rad
+        cosine, sine = stretch * math.cos(turn), stretch * math.sin(turn)
         return ArmEnd(
-            angle, self.x_m + length * math.cos(angle), self.y_m + length * math.sin(angle)
+            turn,
+            self.x_m + cosine * chord_x_m - sine * chord_y_m,
+            self.y_m + sine * chord_x_m + cosine * chord_y_m,
         )
 
 
 CLAMP = ArmEnd(0.0, 0.0, 0.0)
-"""Where the arm begins: it leaves the clamp along x."""
+"""Where the arm begins."""
 
 
 @dataclass(frozen=True)

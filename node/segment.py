@@ -27,7 +27,8 @@ class Segment:
     """The state of one node within its tick. Not thread-safe: the process around it holds a lock.
 
     `record` gets one row a tick: y (2), xh (4), u, setpoint, bump, c, d, then the instants on the
-    monotonic clock, in ns, at which the measurement, c (unless first), d (unless last) came and the command left.
+    monotonic clock, in ns, at which the measurement, c (unless first), d (unless last) came and the
+    command left.
     """
 
     def __init__(

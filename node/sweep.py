@@ -10,7 +10,7 @@ answers the sums that come from its two neighbours and computes the next estimat
 
 Matrices act on the deviation from the reference, out = M (in - in_ref(k)) + out_ref(k+1); which setpoint's
 they are is decided by the tip node (`node.scheduling`). For that the sums are longer than the products: c ends
-with angle and place of the arm so far, d with the setpoint of the next tick.
+with turn and end of the arm so far, d with the setpoint of the next tick.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ from wire.reference import TERMS, Leg, Reference
 Array = npt.NDArray[np.float64]
 Numbers = Array | Sequence[float]
 
+CHORD = 2
+"""Numbers of a reference behind state and command: x and y from the inner to the outer face, m."""
 MEASURED = [1, 3]
 """Which of the state's components are measured: v_y and k."""
 
@@ -58,15 +60,15 @@ class _Products:
 
 def resting_at(factors: SweepFactors) -> Reference:
     """The reference of a run that rests at a setpoint: the setpoint as its commands hold it."""
-    coefficients = np.zeros((TERMS, OUTPUTS, 1))
-    coefficients[0, :, 0] = factors.out_offset
+    coefficients = np.zeros((TERMS, OUTPUTS + CHORD, 1))
+    coefficients[0, :OUTPUTS, 0] = factors.out_offset
     return Reference(1.0, [Leg(0.0, 0.0, coefficients)])
 
 
 class NodeSweep:
     """One node's sweep and its state: `estimate` (4,) (v_x, v_y, e, k) and `command`, absolute, SI.
 
-    `reference` gives state and command (5,) that are wanted at each tick; None rests at the setpoint.
+    `reference` gives what is wanted at each tick, (7,): state, command and chord; None rests at the setpoint.
     `sectors` is what the tip node decides by; None keeps the setpoint. `fade` is the factor a tick of
     the command's bump, see `output`.
 
@@ -93,7 +95,7 @@ class NodeSweep:
         """How many numbers d has."""
         self._first = factors.index == 0
         self._last = factors.index == factors.nodes - 1
-        self._lengths = (float(factors.lengths_m[0]), float(factors.lengths_m[1]))
+        self._bend = factors.bend_m
         self._products = [_Products(one) for one in factors.setpoints]
         self.select(setpoint)
         self._decided = setpoint
@@ -197,7 +199,7 @@ class NodeSweep:
         self._announced = self._decided if self._last else int(d[-1])
         if self._last:
             self._tip = self._grown(x, c)
-        return np.add(self._output, self._then, out=self._output)
+        return np.add(self._output, self._then[:OUTPUTS], out=self._output)
 
     def accept(self, output: Numbers) -> None:
         """Make an output (5,) the state: estimate and command of the tick that begins."""
@@ -215,14 +217,17 @@ class NodeSweep:
 
     def _aim(self) -> None:
         """The reference of this tick as an offset of the input: its measurement is part of its state."""
-        self._offset[:OUTPUTS] = self._now
+        self._offset[:OUTPUTS] = self._now[:OUTPUTS]
         self._offset[OUTPUTS:] = self._now[MEASURED]
         self._aimed = self._now
+        _, _, self._strain, self._curvature, _, self._chord_x, self._chord_y = self._now.tolist()
 
     def _grown(self, x: Array, c: Numbers) -> ArmEnd:
         """The estimated arm up to this segment's outer face."""
         so_far = CLAMP if self._first else ArmEnd(*map(float, c[-FORWARD_EXTRA:]))
-        return so_far.grown(float(x[2]), float(x[3]), *self._lengths)
+        turn = (float(x[3]) - self._curvature) * self._bend
+        stretch = (1.0 + float(x[2])) / (1.0 + self._strain)
+        return so_far.grown(turn, stretch, self._chord_x, self._chord_y)
 
     def _receive(self, buffer: Array, values: Numbers, expected: int, direction: str) -> None:
         if len(values) != expected:

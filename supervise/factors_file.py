@@ -20,7 +20,7 @@ def readable(factors: NodeFactors) -> dict[str, Any]:
     return {
         "index": factors.index,
         "nodes": factors.nodes,
-        "lengths_m": factors.lengths_m.tolist(),
+        "bend_m": factors.bend_m,
         "initial_estimate": factors.initial_estimate.tolist(),
         "initial_command_n_per_m": factors.initial_command.tolist(),
         "setpoints": [

@@ -24,8 +24,9 @@ MEASUREMENT = ("velocity_y_m_per_s", "curvature_per_m")
 STATE = ("velocity_x_m_per_s", "velocity_y_m_per_s", "strain", "curvature_per_m")
 COMMAND = ("force_n_per_m",)
 SCHEDULE = ("setpoint", "bump_n_per_m")
-ARM_SO_FAR = ("angle_rad", "x_m", "y_m")
-"""Last numbers of a forward sum: where the estimated arm ends that leads from the root to the receiver."""
+ARM_SO_FAR = ("turn_rad", "x_m", "y_m")
+"""Last numbers of a forward sum: the estimated arm from the root to the receiver, its turn from the reference
+and where it ends."""
 ANNOUNCED = ("setpoint",)
 """Last number of a backward sum: the setpoint whose gains are in use from the next tick on."""
 TIP = ("x_m", "y_m", "error_m", "reference_x_m", "reference_y_m")

@@ -8,6 +8,7 @@ little-endian float64].
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
@@ -26,7 +27,7 @@ OUTPUTS = 5
 STATES = 4
 """Numbers of a node's estimate."""
 FORWARD_EXTRA = 3
-"""Numbers behind a forward sum: angle and position (x, y) of the estimated arm so far (scheduling)."""
+"""Numbers behind a forward sum: turn from the reference and end (x, y) of the estimated arm so far."""
 BACKWARD_EXTRA = 1
 """Numbers behind a backward sum: the setpoint whose factors are used from the next tick on."""
 
@@ -110,14 +111,14 @@ class NodeFactors:
 
     `initial_estimate` (setpoints, 4) and `initial_command` (setpoints,) are xh(0) and u(0),
     absolute, when the run starts at that setpoint: the estimate starts at the setpoint, the command
-    at its feed-forward. The sums of all setpoints have the same lengths. `lengths_m` (2,): of the
-    segment, and of the stretch that its curvature bends, from the centre before to its own.
+    at its feed-forward. The sums of all setpoints have the same lengths. `bend_m`: length
+    of the stretch that its curvature bends, from the centre before to its own.
     UsageError if something does not fit.
     """
 
     index: int
     nodes: int
-    lengths_m: Array
+    bend_m: float
     initial_estimate: Array
     initial_command: Array
     setpoints: tuple[SweepFactors, ...]
@@ -138,10 +139,10 @@ class NodeFactors:
             raise UsageError(
                 f"factors of node {self.index}: there are {self.nodes} nodes; deploy the gains again"
             )
-        if self.lengths_m.shape != (2,):
+        if not (math.isfinite(self.bend_m) and self.bend_m > 0.0):
             raise UsageError(
-                f"factors of node {self.index}, lengths_m: expected 2 numbers, got shape "
-                f"{self.lengths_m.shape}; deploy the gains again"
+                f"factors of node {self.index}, bend_m: expected a positive length, got "
+                f"{self.bend_m!r}; deploy the gains again"
             )
         if any((f.W.shape, f.V.shape) != (first.W.shape, first.V.shape) for f in self.setpoints):
             raise UsageError(
@@ -165,7 +166,7 @@ class NodeFactors:
         return {
             "index": self.index,
             "nodes": self.nodes,
-            "lengths_m": _pack(self.lengths_m),
+            "bend_m": self.bend_m,
             "initial_estimate": _pack(self.initial_estimate),
             "initial_command": _pack(self.initial_command),
             "setpoints": [factors.to_plain() for factors in self.setpoints],
@@ -176,6 +177,7 @@ class NodeFactors:
         """From `to_plain`; UsageError names what is missing or damaged."""
         try:
             index, nodes, setpoints = plain["index"], plain["nodes"], plain["setpoints"]
+            bend = plain["bend_m"]
         except (KeyError, TypeError) as error:
             raise UsageError(
                 f"factors of a node: {error} is missing; deploy the gains again"
@@ -183,7 +185,7 @@ class NodeFactors:
         return cls(
             index=int(index),
             nodes=int(nodes),
-            lengths_m=_unpack(plain, "lengths_m"),
+            bend_m=float(bend),
             initial_estimate=_unpack(plain, "initial_estimate"),
             initial_command=_unpack(plain, "initial_command"),
             setpoints=tuple(SweepFactors.from_plain(factors) for factors in setpoints),

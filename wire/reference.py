@@ -72,10 +72,10 @@ class Leg:
 class Reference:
     """What a run wants at each tick; `at(k)` gives the quantities (q,), read-only, the same array at rest.
 
-    The last `held` quantities are commands, which stay as they are for a tick: they are taken in its middle.
+    The quantity `held` is a command, which stays as it is for a tick: it is taken in the tick's middle.
     """
 
-    def __init__(self, tick_s: float, legs: Sequence[Leg], held: int = 0) -> None:
+    def __init__(self, tick_s: float, legs: Sequence[Leg], held: int | None = None) -> None:
         if not legs:
             raise UsageError("reference: no leg; a rest is one of 0 s")
         begins = [leg.begin_s for leg in legs]
@@ -94,15 +94,15 @@ class Reference:
         self._first = self._moving(0, 0.0) if legs[0].move_s > 0.0 else self._last[0]
 
     def at(self, tick: int) -> Array:
-        """The quantities (q,) at the start of a tick, those that are held in its middle."""
+        """The quantities (q,) at the start of a tick, the one that is held in its middle."""
         now = self._when(tick * self.tick_s)
-        if not self.held:
+        if self.held is None:
             return now
         middle = self._when((tick + 0.5) * self.tick_s)
         if middle is now:
             return now
         out = now.copy()
-        out[-self.held :] = middle[-self.held :]
+        out[self.held] = middle[self.held]
         out.flags.writeable = False
         return out
 
@@ -147,7 +147,8 @@ class Reference:
                 Leg(begin, move, np.frombuffer(raw, dtype="<f8").reshape(shape).astype(np.float64))
                 for begin, move, *shape, raw in plain["legs"]
             ]
-            return cls(float(plain["tick_s"]), legs, int(plain["held"]))
+            held = plain["held"]
+            return cls(float(plain["tick_s"]), legs, None if held is None else int(held))
         except (KeyError, TypeError, ValueError) as error:
             raise UsageError(f"reference: damaged ({error}); deploy the gains again") from None
 

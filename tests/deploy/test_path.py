@@ -58,6 +58,15 @@ def test_velocities_are_the_rates_of_the_places(there: References) -> None:
         assert now[2] == pytest.approx(mean, rel=0.1)
 
 
+def test_chords_lead_from_the_clamp_to_the_tip(gains: GainsArtefact) -> None:
+    """Also on a grid whose three curvatures could not be added up to the shape."""
+    legs = [LegConfig("2", (), 10.0, 0.0)]
+    coarse = make_references(gains, make_grid(1.0, 3, "equispaced"), TICK, "1", 0.0, legs)
+    for tick in (0, 30, 60, 200):
+        tip = coarse.chords_m(tick).sum(axis=0)
+        np.testing.assert_allclose(tip, coarse.plant.at(tick)[:2], atol=1e-3)
+
+
 def test_the_way_back_is_the_way_there_backwards(gains: GainsArtefact) -> None:
     both = [LegConfig("2", (), 10.0, 0.0), LegConfig("1", (), 10.0, 0.0)]
     back_and_forth = make_references(gains, GRID, TICK, "1", 0.0, both)

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from analysis.shape_error import face_positions
 from node.scheduling import CLAMP, ArmEnd, Sectors
 from wire.run_config import SchedulingConfig
 
@@ -62,14 +61,26 @@ def test_without_hysteresis_the_boundary_decides_and_a_setpoint_outside_is_left(
     assert Sectors.only(3).choose(3, tip(80.0)) == 3
 
 
-def test_the_arm_grows_segment_by_segment_to_the_shape_of_all_states() -> None:
+def test_the_arm_grows_segment_by_segment_as_turned_and_stretched_chords() -> None:
     random = np.random.default_rng(2)
-    faces = np.array([0.0, 0.1, 0.25, 0.6, 0.7, 1.0])
-    states = random.standard_normal((5, 4)) * [1.0, 1.0, 0.1, 3.0]
-    middle = 0.5 * (faces[1:] + faces[:-1])
-    bend = np.diff(np.concatenate([[0.0], middle]))
-    end, places = CLAMP, []
-    for i, (_, _, strain, curvature) in enumerate(states):
-        end = end.grown(strain, curvature, faces[i + 1] - faces[i], bend[i])
-        places.append([end.x_m, end.y_m])
-    np.testing.assert_allclose(places, face_positions(states, faces), rtol=1e-13, atol=1e-13)
+    turns, stretches = 0.3 * random.standard_normal(5), 1.0 + 0.1 * random.standard_normal(5)
+    chords = random.standard_normal((5, 2))
+    end = CLAMP
+    for turn, stretch, (x, y) in zip(turns, stretches, chords, strict=True):
+        end = end.grown(float(turn), float(stretch), float(x), float(y))
+    whole = np.cumsum(turns)
+    expected = sum(
+        stretches[i] * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) @ chords[i]
+        for i, a in enumerate(whole)
+    )
+    np.testing.assert_allclose(end, [whole[-1], *expected], rtol=1e-13, atol=1e-13)
+
+
+def test_an_arm_that_bends_as_a_whole_is_seen_where_it_is() -> None:
+    """Reference straight, estimate an arc: turned chords are the arc's own to second order in the segments."""
+    n, bend = 40, 1.2
+    end = CLAMP
+    for i in range(n):
+        end = end.grown(bend * (0.5 if i == 0 else 1.0) / n, 1.0, 1.0 / n, 0.0)
+    assert end.x_m == pytest.approx(np.sin(bend) / bend, abs=1e-3)
+    assert end.y_m == pytest.approx((1.0 - np.cos(bend)) / bend, abs=1e-3)

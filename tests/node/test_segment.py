@@ -36,7 +36,7 @@ def factors(index: int, nodes: int, seed: int = 0) -> NodeFactors:
     made = {k: 3.0 * rng.normal(size=shape) for k, shape in shapes.items()}
     made["in_offset"] = np.concatenate([made["out_offset"], made["out_offset"][[1, 3]]])
     start = rng.normal(size=(1, 4)), rng.normal(size=1)
-    return NodeFactors(index, nodes, np.array([0.1, 0.1]), *start, (SweepFactors(**made),))
+    return NodeFactors(index, nodes, 0.1, *start, (SweepFactors(**made),))
 
 
 class Bench:
@@ -105,8 +105,8 @@ def test_numbers_are_those_of_the_equations() -> None:
     out = f.D @ x + f.P @ c + f.U @ d + f.out_offset
     np.testing.assert_allclose(sent["forward"][:3], f.W @ c + f.Q @ x, rtol=1e-13)
     np.testing.assert_allclose(sent["backward"], [*(f.V @ d + f.R @ x), 0.0], rtol=1e-13)
-    angle, length = 0.1 + 0.1 * held[3], 0.1 * (1.0 + held[2])
-    end = [angle, 0.5 + length * np.cos(angle), 0.2 + length * np.sin(angle)]
+    turn = 0.1 + 0.1 * (held[3] - f.out_offset[3])
+    end = [turn, 0.5, 0.2]  # a node that only rests knows no chord
     np.testing.assert_allclose(sent["forward"][3:], end, rtol=1e-13)
     np.testing.assert_allclose(sent["command"], out[4:], rtol=1e-13)
     row = bench.rows[0]

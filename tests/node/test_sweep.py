@@ -9,7 +9,7 @@ from wire.errors import OctarmError, UsageError
 from wire.factors import INPUTS, OUTPUTS, NodeFactors, SweepFactors
 from wire.reference import Leg, Reference
 
-LENGTHS = (0.1, 0.07)
+BEND = 0.07
 SO_FAR = [0.3, 0.2, -0.1]
 """Angle and place that come with a forward sum."""
 
@@ -38,7 +38,7 @@ def random_node(seed: int, sizes: list[tuple[int, int, int, int]]) -> NodeFactor
     return NodeFactors(
         index=0 if sizes[0][0] == 0 else 3,
         nodes=4 if sizes[0][2] == 0 else 5,
-        lengths_m=np.array(LENGTHS),
+        bend_m=BEND,
         initial_estimate=random.standard_normal((len(sizes), 4)),
         initial_command=random.standard_normal(len(sizes)),
         setpoints=tuple(random_factors(seed + i, *size) for i, size in enumerate(sizes)),
@@ -195,15 +195,20 @@ def test_the_tip_decides_by_its_estimate_and_says_so_a_tick_later() -> None:
 
 def test_the_reference_of_this_tick_goes_in_and_that_of_the_next_comes_out() -> None:
     node = random_node(16, [(2, 3, 4, 5)])
-    coefficients = np.random.default_rng(17).standard_normal((4, 5, 3))
+    coefficients = np.random.default_rng(17).standard_normal((4, 7, 3))
     reference = Reference(0.1, [Leg(0.1, 0.3, coefficients)])
     sweep = NodeSweep(node, reference=reference)
     f = node.setpoints[0]
     for tick in range(6):
         x = sweep.input([0.4, -0.6]).copy()
-        now, then = reference.at(tick), reference.at(tick + 1)
+        now, then = reference.at(tick)[:5], reference.at(tick + 1)[:5]
         z = x - np.concatenate([now, now[[1, 3]]])
         expected = f.D @ z + f.P @ [0.1, 0.2] + f.U @ [1.0, 2.0, 3.0, 4.0] + then
         out = sweep.output(x, [0.1, 0.2, *SO_FAR], [1.0, 2.0, 3.0, 4.0, 0.0])
         np.testing.assert_allclose(out, expected, rtol=1e-12, atol=1e-12)
+        turn = SO_FAR[0] + BEND * (x[3] - now[3])
+        chord = complex(*reference.at(tick)[5:]) * (1.0 + x[2]) / (1.0 + now[2])
+        end = complex(*SO_FAR[1:]) + chord * np.exp(1j * turn)
+        sent = sweep.forward(x, [0.1, 0.2, *SO_FAR])[-3:]
+        np.testing.assert_allclose(sent, [turn, end.real, end.imag], rtol=1e-12, atol=1e-12)
         sweep.accept(out * 0.1)
