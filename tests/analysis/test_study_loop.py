@@ -121,9 +121,9 @@ def test_the_norm_at_rest_is_the_shift_that_a_steady_load_makes() -> None:
     bend, push = (0.5 * (up - down) for down, up in zip(*ends, strict=True))
     units = GAINS.arm.bending_stiffness_n_m2 / load  # the arm is 1 m long
     width = np.array([0.125, 0.25, 0.25, 0.25])
-    assert static[1] == pytest.approx(units * float(width @ bend), rel=1e-3)
+    assert static[1] == pytest.approx(units * float(width @ bend), rel=2e-3)
     share = np.array([0.375, 0.25, 0.25, 0.125])  # the first from the clamp on
-    np.testing.assert_allclose(static[2:], 0.2 * np.sqrt(share) * push / load, rtol=1e-3)
+    np.testing.assert_allclose(static[2:], 0.2 * np.sqrt(share) * push / load, rtol=2e-3)
     assert abs(static[0]) < 1e-6  # no mean velocity
     assert np.linalg.norm(static) <= channel.hinf_norm()
 
