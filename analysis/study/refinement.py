@@ -53,9 +53,9 @@ SHAPES = 4
 """Places along the arm, equally spaced to the tip, where shapes are compared."""
 TESTS = 3
 """Smooth states that the gain operators are tried on."""
-FASTEST_RAD_PER_S = 30.0
-"""Modes above it, faster than a tick of 0.1 s can turn, are left out of the decay. The gains hardly damp the
-axial ones among them: their decay tends to half the drag with the frequency, however fine the grid."""
+FASTEST_RAD_PER_S = 20.0
+"""Faster modes, w h > 2 with a tick of 0.1 s, are left out of the decay: the tick cannot turn them at their
+rate. The gains hardly damp the axial ones among them: their decay tends to half the drag with the frequency."""
 COARSER = 16
 """Polynomials of the second reference, from which the first one's own error is judged."""
 CLAMPED_FREE = (1.8751040687119611, 0.7340955137589128)
