@@ -8,6 +8,7 @@ controllers leave the observers' gains as they are.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import fcntl
 import hashlib
@@ -20,9 +21,7 @@ from typing import IO, Any
 
 import msgspec
 
-import deploy
 import design
-import wire.artefact
 from design.arm_file import ArmFile
 from design.command import Job, versions
 from design.gain import GainDesign, Options
@@ -144,13 +143,24 @@ class GainParts:
 
 
 @cache
-def code_digest() -> str:
-    """SHA-256 of the programs that gains come from: the rooms design and deploy, and the artefact's format."""
+def code_digest(root: Path = Path(design.__path__[0]).parent) -> str:
+    """SHA-256 of the programs that gains come from: `design.gain` and all of the project that it imports."""
     digest = hashlib.sha256()
-    roots = [Path(room.__path__[0]) for room in (design, deploy)]
-    files = [file for root in roots for file in sorted(root.rglob("*.py"))]
-    for file in (*files, Path(wire.artefact.__file__)):
-        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    found: dict[str, bytes] = {}
+    waiting = ["design.gain"]
+    while waiting:
+        name = waiting.pop()
+        file = root.joinpath(*name.split(".")).with_suffix(".py")
+        if name in found or not file.is_file():  # a name in a module, or not of the project
+            continue
+        found[name] = file.read_bytes()
+        for node in ast.walk(ast.parse(found[name])):
+            if isinstance(node, ast.Import):
+                waiting += [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                waiting += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    for name in sorted(found):
+        digest.update(name.encode() + b"\0" + found[name] + b"\0")
     return digest.hexdigest()
 
 
