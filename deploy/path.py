@@ -35,7 +35,9 @@ Array = npt.NDArray[np.float64]
 DEGREES = (12, 24, 48)
 """Degrees in sigma to try."""
 RESOLVED = 1e-7
-"""The last coefficients of every quantity are below this share of its largest."""
+"""The last coefficients of every quantity are below this share of its largest, or below `FLOOR`."""
+FLOOR = 1e-9
+"""In SI units: nothing that a sensor or the tip would show."""
 NODE = (*STATE, *COMMAND, "chord_x_m", "chord_y_m")
 """Quantities of a node's reference: at the places of its state and command, and from inner to outer face."""
 HELD = len(STATE)
@@ -214,7 +216,7 @@ def _resolved(found: _Samples, degree: int) -> bool:
     quantities = found.position, found.strain, found.curvature, found.holding, found.push
     for values in quantities:
         series = np.abs(_series(values, degree))
-        if np.max(series[-2:]) > RESOLVED * np.max(series):
+        if np.max(series[-2:]) > max(RESOLVED * np.max(series), FLOOR):
             return False
     return True
 

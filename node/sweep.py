@@ -107,6 +107,11 @@ class NodeSweep:
         self._next_bump = 0.0
         self._reference = reference or resting_at(factors.setpoints[setpoint])
         self._now, self._then = self._reference.at(0), self._reference.at(1)
+        if self._now.shape != (OUTPUTS + CHORD,):
+            raise UsageError(
+                f"node {self.index}: expected a reference of {OUTPUTS + CHORD} numbers, got "
+                f"{self._now.size}; deploy the gains again"
+            )
         self._offset = np.zeros(INPUTS)
         self._aimed = self._now
         self._aim()

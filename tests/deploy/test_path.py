@@ -124,3 +124,10 @@ def test_shapes_on_the_way_that_cannot_be_held_are_refused(gains: GainsArtefact)
         make_references(more, GRID, TICK, "1", 0.0, [LegConfig("far", (), 5.0, 0.0)])
     with pytest.raises(UsageError, match="setpoint 'nowhere' is not in the gains artefact"):
         make_references(gains, GRID, TICK, "1", 0.0, [LegConfig("nowhere", (), 5.0, 0.0)])
+
+
+def test_a_way_to_where_the_arm_is_is_a_rest(gains: GainsArtefact) -> None:
+    """As when a start is asked for on the command line that is the first leg's end."""
+    way = make_references(gains, GRID, TICK, "2", 1.0, [LegConfig("2", (), 5.0, 0.0)])
+    for tick in (0, 30, 45, 100):
+        np.testing.assert_allclose(way.states(tick), way.states(0), atol=1e-9)

@@ -212,3 +212,10 @@ def test_the_reference_of_this_tick_goes_in_and_that_of_the_next_comes_out() -> 
         sent = sweep.forward(x, [0.1, 0.2, *SO_FAR])[-3:]
         np.testing.assert_allclose(sent, [turn, end.real, end.imag], rtol=1e-12, atol=1e-12)
         sweep.accept(out * 0.1)
+
+
+def test_a_reference_of_another_shape_is_refused() -> None:
+    node = random_node(18, [(2, 3, 4, 5)])
+    short = Reference(0.1, [Leg(0.0, 0.0, np.zeros((4, 5, 1)))])
+    with pytest.raises(UsageError, match="node 3: expected a reference of 7 numbers, got 5"):
+        NodeSweep(node, reference=short)
