@@ -15,6 +15,8 @@ from supervise.shipped import DEFAULT_GAINS
 from wire.errors import UsageError
 
 MOST_NODES = 1000
+MOST_TICKS = 10_000_000
+"""A recording of so many has tens of gigabytes."""
 DEFAULT_SCENARIO = "hold"
 
 
@@ -56,6 +58,8 @@ class RunOptions:
             raise UsageError(f"--nodes: expected at most {MOST_NODES}, got {self.nodes}")
         if self.ticks is not None:
             _at_least("--ticks", self.ticks, 1, "one tick is the shortest run")
+            if self.ticks > MOST_TICKS:
+                raise UsageError(f"--ticks: expected at most {MOST_TICKS}, got {self.ticks}")
         _at_least("--seed", self.seed, 0, "any whole number from 0 on")
         _positive("--tick", self.tick_s, "seconds")
         _positive("--start-timeout", self.start_timeout_s, "seconds")

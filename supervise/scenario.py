@@ -18,7 +18,7 @@ from plant.disturbance import DisturbanceSpec
 from plant.grid import plant_cells
 from plant.initial import check_name
 from plant.noise import SensorNoise
-from supervise.options import RunOptions
+from supervise.options import MOST_TICKS, RunOptions
 from supervise.shipped import SCENARIOS
 from wire.errors import UsageError
 from wire.run_config import DisturbanceConfig, LegConfig, NoiseConfig
@@ -187,7 +187,7 @@ def settle(options: RunOptions) -> Course:
         setpoint=_given(options.setpoint, scenario.start),
         initial=_given(options.initial, scenario.initial),
         control=scenario.control,
-        ticks=_given(options.ticks, max(1, round(scenario.duration_s / options.tick_s))),
+        ticks=_ticks(scenario, options.tick_s) if options.ticks is None else options.ticks,
         plant_cells=plant_cells(options.nodes, cells),
         first_hold_s=scenario.hold_s,
         legs=tuple(LegConfig(leg.to, leg.through, leg.move_s, leg.hold_s) for leg in scenario.legs),
@@ -199,6 +199,17 @@ def settle(options: RunOptions) -> Course:
         hysteresis_deg=scenario.scheduling.hysteresis_deg,
         bump_s=scenario.scheduling.bump_s,
     )
+
+
+def _ticks(scenario: Scenario, tick_s: float) -> int:
+    """As many as the scenario takes."""
+    ticks = scenario.duration_s / tick_s
+    if not ticks <= MOST_TICKS:
+        raise UsageError(
+            f"scenario {scenario.name}: it takes {scenario.duration_s:.6g} s, {ticks:.3g} ticks of "
+            f"{tick_s:g} s; expected at most {MOST_TICKS} ticks; shorten it or give --ticks"
+        )
+    return max(1, round(ticks))
 
 
 def _given(option: T | None, default: T) -> T:

@@ -21,6 +21,7 @@ WRONG = {
     "no number": (["--nodes", "four"], 2, "four"),
     "too many nodes": (["--nodes", "100000"], 2, "--nodes"),
     "negative ticks": (["--ticks", "-5"], 2, "--ticks"),
+    "too many ticks": (["--ticks", "9" * 30], 2, "--ticks"),
     "zero ticks": (["--ticks", "0"], 2, "--ticks"),
     "negative tick": (["--tick", "-0.1"], 2, "--tick"),
     "tick not a number": (["--tick", "nan"], 2, "--tick"),

@@ -172,6 +172,17 @@ def test_options_win_over_the_scenario(tmp_path: Path) -> None:
     assert settle(RunOptions(scenario=str(path), tick_s=0.05)).ticks == 200
 
 
+@pytest.mark.parametrize("hold_s", ["1e7", "1e308"])
+def test_a_scenario_that_never_ends_is_refused_unless_ticks_are_given(
+    hold_s: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "long.toml"
+    path.write_text(GOOD.replace("hold_s = 0.5", f"hold_s = {hold_s}").replace("1.5", hold_s))
+    with pytest.raises(UsageError, match=r"scenario there: it takes .* at most 10000000 ticks"):
+        settle(RunOptions(scenario=str(path)))
+    assert settle(RunOptions(scenario=str(path), ticks=5)).ticks == 5
+
+
 def test_sectors_lie_midway_between_the_tips_that_are_visited(gains: Path) -> None:
     prepared = prepare(RunOptions(gains=gains, setpoint="1"))
     alone = scheduling(prepared.artefact, prepared.course)
