@@ -21,6 +21,8 @@ Array = npt.NDArray[np.float64]
 CELLS_PER_SEGMENT = 4
 """The plant's grid is at least this much finer than the controller's (theory, section 6)."""
 FEWEST_DEFAULT_CELLS = 40
+MOST_CELLS = 4000
+"""Matrices of the grid have the square of it numbers, and substeps shrink with its square."""
 _STENCIL = 4  # samples in one interpolation: local cubic polynomials
 
 
@@ -28,8 +30,8 @@ def plant_cells(segments: int, asked: int | None = None) -> int:
     """Number of cells of the plant's grid for a number of segments.
 
     Without `asked` it is max(40, 4 segments). Raises UsageError if fewer than 4 cells a segment are
-    asked for: the plant would then share the controller's discretisation error and prove nothing
-    about it.
+    asked for (the plant would then share the controller's discretisation error and prove nothing
+    about it), or more than `MOST_CELLS`.
     """
     fewest = max(_STENCIL, CELLS_PER_SEGMENT * segments)
     if asked is None:
@@ -39,6 +41,8 @@ def plant_cells(segments: int, asked: int | None = None) -> int:
             f"plant cells: expected at least {fewest} ({CELLS_PER_SEGMENT} for each of the "
             f"{segments} segments), got {asked}; ask for more cells or fewer segments"
         )
+    if asked > MOST_CELLS:
+        raise UsageError(f"plant cells: expected at most {MOST_CELLS}, got {asked}")
     return asked
 
 

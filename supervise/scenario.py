@@ -87,18 +87,21 @@ def read_scenario(name: str) -> Scenario:
 
     Raises UsageError naming the file, the key, what was expected and what was found.
     """
-    path = Path(name)
+    path, known = Path(name), sorted(one.stem for one in SCENARIOS.glob("*.toml"))
     if path.suffix == "" and path.name == name:
-        path = SCENARIOS / f"{name}.toml"
-        if not path.exists():
-            known = ", ".join(sorted(p.stem for p in SCENARIOS.glob("*.toml")))
+        if name not in known:
             raise UsageError(
-                f"--scenario {name}: there is no scenario of that name; known: {known}; or give a file"
+                f"--scenario {name}: there is no scenario of that name; known: {', '.join(known)}; or give a "
+                "file"
             )
+        path = SCENARIOS / f"{name}.toml"
     try:
         raw = path.read_bytes()
     except OSError as error:
-        raise UsageError(f"--scenario {path}: {error.strerror or error}") from None
+        raise UsageError(
+            f"--scenario {name}: {error.strerror or error}; give a scenario file, or the name of one: "
+            f"{', '.join(known)}"
+        ) from None
     try:
         scenario = msgspec.toml.decode(raw, type=Scenario)
     except (msgspec.DecodeError, UnicodeDecodeError, OverflowError, RecursionError) as error:
@@ -178,6 +181,12 @@ def settle(options: RunOptions) -> Course:
         disturbance |= {"name": options.disturbance, "amplitude": 1.0}
     if options.disturbance_amplitude is not None:
         disturbance["amplitude"] = options.disturbance_amplitude
+    for number, leg in enumerate(scenario.legs):
+        if leg.move_s < options.tick_s:
+            raise UsageError(
+                f"scenario {scenario.name}: legs[{number}].move_s: expected at least a tick, "
+                f"{options.tick_s:g} s, got {leg.move_s!r}"
+            )
     noise = scenario.noise
     cells = options.plant_cells
     if cells is None and scenario.plant_cells is not None:

@@ -105,7 +105,9 @@ def test_names_and_files_that_do_not_exist(tmp_path: Path) -> None:
         UsageError, match="no scenario of that name; known: chapter, hold, reach, track"
     ):
         read_scenario("dance")
-    with pytest.raises(UsageError, match=r"none\.toml: No such file"):
+    with pytest.raises(UsageError, match="no scenario of that name"):
+        read_scenario("x" * 5000)
+    with pytest.raises(UsageError, match=r"none\.toml: No such file.* chapter, hold, reach, track"):
         read_scenario(str(tmp_path / "none.toml"))
     with pytest.raises(UsageError, match="directory"):
         read_scenario(str(tmp_path) + "/")
@@ -181,6 +183,14 @@ def test_a_scenario_that_never_ends_is_refused_unless_ticks_are_given(
     with pytest.raises(UsageError, match=r"scenario there: it takes .* at most 10000000 ticks"):
         settle(RunOptions(scenario=str(path)))
     assert settle(RunOptions(scenario=str(path), ticks=5)).ticks == 5
+
+
+def test_a_move_within_a_tick_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "quick.toml"
+    path.write_text(GOOD.replace("move_s = 4.0\nhold", "move_s = 0.05\nhold"))
+    with pytest.raises(UsageError, match=r"legs\[0\]\.move_s: expected at least a tick, 0\.1 s"):
+        settle(RunOptions(scenario=str(path)))
+    assert settle(RunOptions(scenario=str(path), tick_s=0.05)).ticks == 121
 
 
 def test_sectors_lie_midway_between_the_tips_that_are_visited(gains: Path) -> None:

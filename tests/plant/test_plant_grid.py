@@ -13,7 +13,9 @@ def test_cells_default_to_forty_or_four_a_segment() -> None:
     assert plant_cells(10, 57) == 57
 
 
-def test_too_few_cells_are_refused() -> None:
+def test_too_few_and_too_many_cells_are_refused() -> None:
+    with pytest.raises(UsageError, match="at most 4000, got 1000000"):
+        plant_cells(10, 1_000_000)
     with pytest.raises(UsageError, match=r"at least 40 .*got 39"):
         plant_cells(10, 39)
 
