@@ -6,6 +6,7 @@ Between launcher.py, whose verbs say what is done, and the shell. Results go to 
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -37,6 +38,9 @@ def serve(verbs: Mapping[str, Callable[..., int]], prog: str, description: str) 
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # nobody reads the output any more
         code = int(ExitCode.OK)
     except Exception as error:
+        if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
+            print(f"{prog}: {error.filename}: {error.strerror}", file=sys.stderr)
+            sys.exit(int(ExitCode.USAGE))  # only what the user typed can be so long
         code = int(ExitCode.INTERNAL)
         print(f"{prog}: internal error: {error!r}; {_save_traceback()}", file=sys.stderr)
     sys.exit(code)

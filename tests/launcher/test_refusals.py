@@ -80,6 +80,21 @@ def test_wrong_option(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("verb", [["deploy", "--out"], ["animate"]])
+def test_a_name_that_is_too_long_for_a_file(
+    verb: list[str], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["octarm", *verb, "x" * 5000])
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        with pytest.raises(SystemExit) as end:
+            launcher.main()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert end.value.code == 2
+    assert capfd.readouterr().err.endswith("xxx: File name too long\n")
+
+
 def _nothing_may_start(*arguments: object, **options: object) -> None:
     raise AssertionError(f"started {arguments}")
 
