@@ -25,22 +25,31 @@ from design.hinf import (
     HinfResult,
     Stages,
     lpi_eigenvalue,
-    solve_hinf,
 )
 from design.inverse import solve_gain
+from design.moment_lpi import COUNTS, solve_hinf
 from design.setpoint_entry import setpoint_entry
-from design.verify import GRIDS, Achieved, verify_controller, verify_observer
+from design.verify import (
+    GRIDS,
+    Achieved,
+    controller_optimum,
+    observer_optimum,
+    verify_controller,
+    verify_observer,
+)
 from wire.artefact import Arm, Certificate, OperatorFactors, check_gain
 from wire.errors import GainsRefusedError
 
-LEVEL = 2
-"""Krylov level of the rows: 1 certifies too, 2 finds controllers with smaller gains."""
 RANK_TOLERANCES = (5e-2, 2e-2, 1e-2, 3e-3, 1e-3, 1e-4, 1e-6, 1e-10)
 """Kernel directions below this share of the gain are dropped: each costs a number in every message. The
 first entry is taken with which the gain that is left still satisfies the LPI at the same gamma."""
 ACHIEVED_MARGIN = 1e-3
 """Allowance of the finite-difference norm over the certified one (theory, section 3)."""
-STAGES: dict[Role, Stages] = {"observer": Stages(keep=1.0), "controller": Stages()}
+AIM = 1.13
+"""Gamma, as a multiple of the optimum, that is designed for where the inequality reaches it: what lies between
+makes gains moderate."""
+NEAR = 1.16
+"""Multiple of the optimum within which the inequality is near enough; beyond, more moments are taken."""
 Tell = Callable[[str], None]
 
 
@@ -51,7 +60,8 @@ class Options:
     solver: str = "CLARABEL"
     time_limit_s: float = 300.0
     """For one semidefinite program."""
-    level: int = LEVEL
+    counts: tuple[int, ...] = COUNTS
+    """Polynomials a state to try, see `design.moment_lpi`."""
 
 
 class GainDesign(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -90,7 +100,9 @@ def design_gain(
 
     entry = setpoint_entry(arm, setpoint)
     weight = weight_of(file, role)
-    gain = _synthesise(gain_problem(file, setpoint, role), role, name, options, tell)
+    optimum = (observer_optimum if role == "observer" else controller_optimum)(arm, entry, weight)
+    stages = Stages(aim=AIM * optimum, near=NEAR * optimum)
+    gain = _synthesise(gain_problem(file, setpoint, role), stages, name, options, tell)
     if role == "observer":
         factors = observer_factors(gain.factors, arm)
         entry = msgspec.structs.replace(entry, observer=factors)
@@ -112,11 +124,13 @@ def design_gain(
     return GainDesign(factors, certificate)
 
 
-def _synthesise(problem: HinfProblem, role: Role, name: str, options: Options, tell: Tell) -> _Gain:
+def _synthesise(
+    problem: HinfProblem, stages: Stages, name: str, options: Options, tell: Tell
+) -> _Gain:
     result = solve_hinf(
         problem,
-        level=options.level,
-        stages=STAGES[role],
+        counts=options.counts,
+        stages=stages,
         solver=options.solver,
         time_limit_s=options.time_limit_s,
         progress=tell,
@@ -125,7 +139,7 @@ def _synthesise(problem: HinfProblem, role: Role, name: str, options: Options, t
         s = result.solution
         raise GainsRefusedError(
             f"{name}: the LPI is {result.outcome} (solver {options.solver} says {s.status}; "
-            f"equality residual {s.residual:.1e}, smallest Gram eigenvalue {s.smallest_gram_eigenvalue:.1e}). "
+            f"smallest relative eigenvalue of its matrices {s.smallest_eigenvalue:.1e}). "
             "Try other weights, more damping or a less curved setpoint"
         )
     try:
@@ -182,9 +196,9 @@ def _certificate(
         gain_norm=gain.factors.norm(),
         smallest_eigenvalue_p=float(eigenvalues[0]),
         largest_eigenvalue_lpi=gain.eigenvalue,
-        equality_residual=result.solution.residual,
-        gram_sizes=list(result.gram_sizes),
-        equalities=result.solution.equalities,
+        equality_residual=max(0.0, -result.solution.smallest_eigenvalue),
+        gram_sizes=list(result.sizes),
+        equalities=0,
         iterations=result.solution.iterations,
         solver=options.solver,
         solver_status=result.solution.status,

@@ -37,7 +37,7 @@ def observer_problem(
         C1=functional("v_y", "k"),
         C2=selection(*measured),
         rho=noise,
-        rates=pie.strain_rates if pie.retardation > 0.0 else None,
+        drag=pie.drag,
     )
 
 
@@ -54,8 +54,7 @@ def controller_problem(pie: ArmPIE, effort: float, actuator: str = ACTUATORS[0])
         C1=functional("v_y"),
         C2=pie.command(actuator),
         rho=effort,
-        multiples=max(0, min(2, pie.normal.shape[1] - 2)) if actuator == "normal" else 0,
-        rates=pie.strain_rates if pie.retardation > 0.0 else None,
+        drag=pie.drag,
     )
 
 

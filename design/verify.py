@@ -24,7 +24,8 @@ Array = npt.NDArray[np.float64]
 
 GRIDS = (40, 80)
 """Segments of the two grids; the norms at both give the extrapolated value (second order)."""
-RICCATI_GRID = 16
+RICCATI_GRID = 32
+"""The optimum changes by less than 1.3 % beyond (0.1 % but for the controller at the most bent setpoint)."""
 
 
 @dataclass(frozen=True)
@@ -111,14 +112,21 @@ def controller_channel(plant: ArmMatrices, effort: float, *, closed: bool = True
     return Channel(plant.A + plant.force @ plant.K, plant.disturbance, C, np.zeros((len(C), 1)))
 
 
+def observer_optimum(arm: Arm, setpoint: Setpoint, noise: float) -> float:
+    """Norm of the error that no observer of this arm can be below, on the grid of `RICCATI_GRID` segments."""
+    plant = arm_matrices(arm, setpoint, RICCATI_GRID)
+    return riccati_optimum(plant.A.T, plant.outputs.T, plant.disturbance.T, plant.measure.T, noise)
+
+
+def controller_optimum(arm: Arm, setpoint: Setpoint, effort: float) -> float:
+    """Norm that no state feedback can be below, on the grid of `RICCATI_GRID` segments."""
+    plant = arm_matrices(arm, setpoint, RICCATI_GRID)
+    return riccati_optimum(plant.A, plant.disturbance, plant.outputs, plant.force, effort)
+
+
 def verify_observer(arm: Arm, setpoint: Setpoint, noise: float) -> Achieved:
     """Figures of the observer gain of a setpoint; `noise` is the weight of the measurement noise."""
-
-    def optimum(plant: ArmMatrices) -> float:
-        return riccati_optimum(
-            plant.A.T, plant.outputs.T, plant.disturbance.T, plant.measure.T, noise
-        )
-
+    optimum = observer_optimum(arm, setpoint, noise)
     return _verify(
         arm, setpoint, lambda p, closed: observer_channel(p, noise, closed=closed), optimum
     )
@@ -126,10 +134,7 @@ def verify_observer(arm: Arm, setpoint: Setpoint, noise: float) -> Achieved:
 
 def verify_controller(arm: Arm, setpoint: Setpoint, effort: float) -> Achieved:
     """Figures of the state-feedback gain of a setpoint; `effort` weighs the command in z."""
-
-    def optimum(plant: ArmMatrices) -> float:
-        return riccati_optimum(plant.A, plant.disturbance, plant.outputs, plant.force, effort)
-
+    optimum = controller_optimum(arm, setpoint, effort)
     return _verify(
         arm, setpoint, lambda p, closed: controller_channel(p, effort, closed=closed), optimum
     )
@@ -139,7 +144,7 @@ def _verify(
     arm: Arm,
     setpoint: Setpoint,
     channel: Callable[[ArmMatrices, bool], Channel],
-    optimum: Callable[[ArmMatrices], float],
+    optimum: float,
 ) -> Achieved:
     plants = [arm_matrices(arm, setpoint, nodes) for nodes in GRIDS]
     closed = [channel(p, True) for p in plants]
@@ -149,6 +154,6 @@ def _verify(
         gamma=max(norms[1], extrapolated),
         gamma_by_grid=tuple(norms),
         open_loop_gamma=channel(plants[0], False).hinf_norm(),
-        optimum_gamma=optimum(arm_matrices(arm, setpoint, RICCATI_GRID)),
+        optimum_gamma=optimum,
         decay_per_s=min(c.decay() for c in closed) / time_unit_s(arm),
     )
