@@ -10,7 +10,7 @@ run: $(STAMP)
 	$(BIN)/octarm run
 
 test: $(TEST_STAMP)
-	$(BIN)/python -m pytest -n 2
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 lint: $(TEST_STAMP)
 	$(BIN)/ruff check .

@@ -79,10 +79,14 @@ class Channel:
             best = max(best, -float(found.fun))
         return best
 
-    def decay(self) -> float:
-        """Minus the largest real part of the eigenvalues of A; zero where it is no more than rounding."""
+    def decay(self, fastest: float = float("inf")) -> float:
+        """Minus the largest real part of the eigenvalues of A up to `fastest` in modulus.
+
+        Zero where it is no more than rounding; infinite if no mode is that slow.
+        """
         values = np.diag(self._schur[0])
-        slowest = -float(values.real.max())
+        seen = values[np.abs(values) <= fastest]
+        slowest = -float(seen.real.max(initial=-np.inf))
         return slowest if abs(slowest) > _ON_THE_AXIS * np.abs(values).max() else 0.0
 
 

@@ -44,10 +44,10 @@ def jobs(file: ArmFile) -> list[Job]:
 def longest_first(file: ArmFile, some: list[Job]) -> list[Job]:
     """The order that keeps several processors busy to the end.
 
-    Controllers take longer than observers, and more the higher the degree of the setpoint's polynomial frame.
+    Observers take longer than controllers, and more the higher the degree of the setpoint's polynomial frame.
     """
     degrees = [setpoint.frame_degree() for setpoint in file.design_setpoints()]
-    return sorted(some, key=lambda job: (job.role != "controller", -degrees[job.index]))
+    return sorted(some, key=lambda job: (-degrees[job.index], job.role != "observer"))
 
 
 def check_options(options: Options) -> None:

@@ -122,6 +122,6 @@ def lpi_eigenvalue(
     n = problem.T.shape_out.functions * size
     finite = s.x.shape_in.finite
     weight = np.eye(len(matrix))
-    T = problem.T.discretise(size, size + 12)
+    T = problem.T.discretise(size, size + 24)
     weight[finite : finite + n, finite : finite + n] = T.T @ T
     return float(linalg.eigvalsh(matrix + matrix.T, weight)[-1])

@@ -51,7 +51,7 @@ class Setpoint:
         keep = degree + 1
         return legendre.fit(np.cos(theta))[:keep], legendre.fit(np.sin(theta))[:keep]
 
-    def frame_degree(self, tolerance: float = 2e-3, most: int = 5) -> int:
+    def frame_degree(self, tolerance: float = 2e-3, most: int = 10) -> int:
         """The smallest degree whose frame is within `tolerance` of the true one in L2, at the most `most`."""
         for degree in range(most):
             if self.frame_error(degree) <= tolerance:

@@ -146,7 +146,7 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_
     optimum_gamma: float
     """Riccati value of a fine discretisation: no gain can do better."""
     decay_per_s: float
-    """Minus the rightmost real part of the closed loop on the independent discretisation."""
+    """Minus the rightmost real part of the closed loop's modes below 20 rad/s, independent discretisation."""
     gain_norm: float
     """L2-induced norm of the gain operator in nondimensional units."""
     smallest_eigenvalue_p: float
