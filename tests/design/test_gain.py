@@ -20,14 +20,15 @@ from design.arm_file import ArmFile, Damping, read_arm_file
 from design.command import assemble, jobs, longest_first
 from design.gain import GainDesign, Options, design_gain
 from design.gain_problem import gain_problem
-from design.hinf import HinfResult, solve_hinf
+from design.hinf import HinfResult
+from design.moment_lpi import solve_hinf
 from design.setpoint_entry import setpoint_entry
 from design.verify import Achieved
 from wire.artefact import GainsArtefact, read_artefact, write_artefact
 from wire.errors import GainsRefusedError, UsageError
 
 ROOT = Path(__file__).resolve().parents[2]
-SMALL = Options(level=1)
+SMALL = Options(counts=(1,))
 FIGURES = Achieved(
     gamma=0.1, gamma_by_grid=(0.1, 0.1), open_loop_gamma=1.2, optimum_gamma=0.08, decay_per_s=0.01
 )
@@ -47,12 +48,13 @@ def shipped() -> GainsArtefact:
 def solved(straight: ArmFile) -> HinfResult:
     """The straight arm's observer, solved once."""
     problem = gain_problem(straight, straight.design_setpoints()[0], "observer")
-    return solve_hinf(problem, level=1, stages=gain.STAGES["observer"])
+    return solve_hinf(problem, counts=(1,))
 
 
 @pytest.fixture
 def quick(solved: HinfResult, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither solved nor verified again."""
+    """Neither solved nor verified again, and the optimum is known."""
+    monkeypatch.setattr(gain, "observer_optimum", lambda *_: FIGURES.optimum_gamma)
     monkeypatch.setattr(gain, "solve_hinf", lambda *_, **__: solved)
     monkeypatch.setattr(gain, "verify_observer", lambda *_: FIGURES)
 
@@ -74,7 +76,7 @@ def test_a_job_gives_a_gain_that_can_be_sent_and_kept(
     assert certificate.certified_gamma == solved.gamma
     assert certificate.achieved_gamma == FIGURES.gamma
     assert certificate.optimum_gamma == FIGURES.optimum_gamma
-    assert certificate.gram_sizes == list(solved.gram_sizes)
+    assert certificate.gram_sizes == list(solved.sizes)
     # the axial waves of an arm decay with half the drag, and nothing decays more slowly
     half_drag = 0.5 * straight.arm().drag_per_s
     assert certificate.open_loop_decay_per_s == pytest.approx(half_drag, rel=1e-6)
@@ -133,21 +135,14 @@ def test_an_operator_that_cannot_be_inverted(
 
 
 def test_a_solver_that_has_no_time(straight: ArmFile) -> None:
-    message = refusal(straight, Options(level=1, time_limit_s=1e-4))
+    message = refusal(straight, Options(counts=(1,), time_limit_s=1e-4))
     assert message.startswith("setpoint straight, observer: the LPI is unreliable (solver CLARABEL")
 
 
-def test_an_arm_that_creeps(straight: ArmFile) -> None:
-    """Over thousands of units of time: no solver's numbers are any good."""
-    creeping = Damping(first_mode_damping_ratio=1e3)
-    message = refusal(msgspec.structs.replace(straight, damping=creeping))
-    assert message.startswith("setpoint straight, observer: ")
-
-
 def test_an_undamped_arm(straight: ArmFile) -> None:
-    """The norm is bounded, but the axial motion, out of reach of force and sensor, never decays."""
+    """The axial motion, out of reach of force and sensor, never decays: there is no certificate."""
     message = refusal(msgspec.structs.replace(straight, damping=Damping(drag_per_s=0.0)))
-    assert "the closed loop has norm inf and decay 0/s" in message
+    assert message.startswith("setpoint straight, observer: the LPI is infeasible (solver CLARABEL")
 
 
 def test_a_shape_that_no_load_holds(straight: ArmFile) -> None:

@@ -16,15 +16,12 @@ from design.factors import factorise
 from design.gain_problem import Role, controller_problem, observer_problem
 from design.hinf import (
     LPI_TOLERANCE,
-    RESIDUAL_TOLERANCE,
     HinfProblem,
     HinfResult,
-    Stages,
-    _verdict,
     lpi_eigenvalue,
-    solve_hinf,
 )
 from design.inverse import solve_gain
+from design.moment_lpi import solve_hinf
 from design.operators import PIOperator
 
 Array = npt.NDArray[np.float64]
@@ -85,26 +82,17 @@ class Design:
 def design(request: pytest.FixtureRequest) -> Design:
     role: Role = request.param
     lpi = problem(role)
-    result = solve_hinf(lpi, level=1)
+    result = solve_hinf(lpi, counts=(2,))
     factors, _ = factorise(solve_gain(result.P, result.Z), 1e-12)
     return Design(role, lpi, result, factors.operator())
 
 
-def test_certified_between_the_optimum_and_the_published_bound(design: Design) -> None:
+def test_certified_near_the_optimum(design: Design) -> None:
     result = design.result
     assert result.outcome == "certified"
     assert result.solution.status == "optimal"
-    assert result.solution.residual <= RESIDUAL_TOLERANCE
-    assert result.gamma == result.solution.numbers["gamma"]
     assert design.optimum == pytest.approx(0.0784, abs=3e-4)
-    assert design.optimum < result.gamma < 0.16
-
-
-def test_smallest_gamma_is_above_the_optimum(design: Design) -> None:
-    """Without slack the program minimises gamma; no bound can be below the best norm there is."""
-    least = solve_hinf(design.problem, level=1, stages=Stages(slack=0.0, small_delta=1e-3))
-    assert design.optimum * (1.0 - 1e-4) <= least.gamma <= 0.105
-    assert least.gamma < design.result.gamma
+    assert design.optimum < result.gamma < 1.12 * design.optimum
 
 
 def test_closed_loop_in_beam_modes(design: Design) -> None:
@@ -114,7 +102,7 @@ def test_closed_loop_in_beam_modes(design: Design) -> None:
     assert open_loop == pytest.approx(1.24, abs=1e-2)
     assert np.linalg.eigvals(A).real.max() < -0.05
     assert design.optimum <= design.achieved <= design.result.gamma
-    assert design.achieved < 0.15 * open_loop
+    assert design.achieved < 1.1 * design.optimum
 
 
 def test_bound_with_the_gain_put_in(design: Design) -> None:
@@ -196,36 +184,3 @@ def test_eigenvalue_bounds_the_form_everywhere(design: Design) -> None:
         assert value <= bound * size
         positive += value > 0.0
     assert positive > 0  # the form with the wrong gain is seen to be positive, too
-
-
-@pytest.mark.parametrize("role", ["observer", "controller"])
-def test_arm_that_gains_energy_has_no_certificate(role: Role) -> None:
-    """Negative drag: the axial modes grow, and neither sensor nor force reaches them."""
-    result = solve_hinf(problem(role, drag=-DRAG), level=1)
-    assert result.outcome in ("infeasible", "unreliable")  # it may stall instead of a proof
-    assert result.solution.status != "optimal"
-
-
-def test_time_limit_gives_no_certificate() -> None:
-    told: list[str] = []
-    result = solve_hinf(problem("observer"), level=1, time_limit_s=1e-4, progress=told.append)
-    assert result.outcome == "unreliable"
-    assert np.isnan(result.gamma)
-    assert len(told) == 1
-    assert "Gram matrices (8, 18)" in told[0]
-
-
-def test_verdict_is_on_the_recomputed_evidence(design: Design) -> None:
-    solution = design.result.solution
-    assert _verdict(solution) == "certified"
-    assert _verdict(replace(solution, status="optimal_inaccurate")) == "certified"
-    for broken in (
-        replace(solution, residual=10.0 * RESIDUAL_TOLERANCE),
-        replace(solution, residual=float("nan")),
-        replace(solution, smallest_gram_eigenvalue=-1e-3),
-        replace(solution, smallest_gram_eigenvalue=float("nan")),
-        replace(solution, status="user_limit"),
-        replace(solution, status="unbounded"),
-    ):
-        assert _verdict(broken) == "unreliable"
-    assert _verdict(replace(solution, status="infeasible_inaccurate")) == "infeasible"

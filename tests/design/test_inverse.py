@@ -12,8 +12,8 @@ from pi_reference import at, function_part, kernel_at, polynomial, random_operat
 
 from design.arm_pie import arm_pie
 from design.gain_problem import controller_problem, observer_problem
-from design.hinf import solve_hinf
 from design.inverse import SampledKernels, separate, solve_gain
+from design.moment_lpi import solve_hinf
 from design.operators import PIOperator, Shape
 
 Array = npt.NDArray[np.float64]
@@ -150,7 +150,7 @@ def test_kernel_that_is_no_adjoint() -> None:
 def test_gain_of_a_real_design(role: str) -> None:
     pie = arm_pie(np.ones(1), np.zeros(1), 80.0, 0.7)
     problem = observer_problem(pie, 0.1) if role == "observer" else controller_problem(pie, 0.1)
-    result = solve_hinf(problem, level=1)
+    result = solve_hinf(problem, counts=(1,))
     assert relative_error(result.P, result.Z, 30) < 1e-6
 
 

@@ -18,7 +18,7 @@ import pytest
 from stand_in_gains import Immediate, arm, arm_text, well
 
 import launcher
-from design.gain import LEVEL, Options
+from design.gain import Options
 from supervise import designing
 from supervise.designing import Request, run_design
 from wire.artefact import GainsArtefact, digest, read_artefact
@@ -222,7 +222,6 @@ def test_the_command_line_has_the_defaults_of_the_room() -> None:
         for name, parameter in inspect.signature(launcher.design).parameters.items()
     }
     assert Options(defaults["solver"], defaults["time_limit"]) == Options()
-    assert Options().level == LEVEL
     request = Request(Path("a"), Path("b"))
     assert (request.jobs, request.fresh, request.force) == (
         defaults["jobs"],
@@ -274,7 +273,9 @@ def test_certificates(straight: Designed) -> None:
     for certificate in (setpoint.observer_certificate, setpoint.controller_certificate):
         assert certificate.outcome == "certified"
         assert certificate.solver_status in ("optimal", "optimal_inaccurate")
-        assert certificate.achieved_gamma <= certificate.certified_gamma * 1.001 <= 0.16
+        assert certificate.achieved_gamma <= certificate.certified_gamma * 1.001
+        assert certificate.certified_gamma <= 1.3 * certificate.optimum_gamma
+        assert certificate.achieved_gamma <= 1.15 * certificate.optimum_gamma
         assert certificate.optimum_gamma <= certificate.achieved_gamma
         assert certificate.achieved_gamma < 0.15 * certificate.open_loop_gamma
         # the axial motion, out of reach of force and sensor, decays with half the drag
