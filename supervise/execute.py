@@ -42,10 +42,9 @@ def execute(options: RunOptions, *, quiet: bool, plot: bool) -> Result:
     endpoints = choose(options.nodes, options.transport, options.base_port, options.socket_dir)
     try:
         directory, made = _make_directory(options.out, run_id)
-        plan = make_plan(prepared, endpoints, run_id, directory)
-        with choose_view(plan.run.ticks, quiet=quiet) as view:
+        with choose_view(prepared.course.ticks, quiet=quiet) as view:
             try:
-                outcome = _conduct(plan, view)
+                outcome = _conduct(make_plan(prepared, endpoints, run_id, directory), view)
             except BaseException:
                 _remove_if_empty(directory, made)
                 raise
@@ -74,21 +73,28 @@ def _make_directory(out: Path | None, run_id: str) -> tuple[Path, bool]:
     try:
         made = not directory.exists()
         directory.mkdir(parents=True, exist_ok=True)
-        occupied = next(directory.iterdir(), None)
-        probe = directory / ".octarm-probe"
+        occupied = next((file.name for file in directory.iterdir()), None)
         if occupied is None:
-            probe.touch()
-            probe.unlink()
+            occupied = _claim(log_of(directory))
     except OSError as error:
         raise UsageError(
             f"--out {directory}: {error.strerror or error}; give a directory that can be written"
         ) from None
     if occupied is not None:
         raise UsageError(
-            f"--out {directory}: there is something in it already ({occupied.name}); nothing is "
+            f"--out {directory}: there is something in it already ({occupied}); nothing is "
             "written over, give another directory"
         )
     return directory.absolute(), made
+
+
+def _claim(log: Path) -> str | None:
+    """Make the run's log, empty; its name if another run was quicker to take the directory."""
+    try:
+        log.touch(exist_ok=False)
+    except FileExistsError:
+        return log.name
+    return None
 
 
 def _remove_if_empty(directory: Path, made: bool) -> None:

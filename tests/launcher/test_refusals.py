@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 import launcher
+from supervise.execute import execute
+from supervise.options import RunOptions
+from wire.errors import UsageError
 
 if TYPE_CHECKING:
     from conftest import Cli, Start
@@ -97,6 +100,37 @@ def test_a_name_that_is_too_long_for_a_file(
 
 def _nothing_may_start(*arguments: object, **options: object) -> None:
     raise AssertionError(f"started {arguments}")
+
+
+def test_a_plan_that_is_refused_leaves_no_directory(
+    gains: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise UsageError("two tips in one direction")
+
+    monkeypatch.setattr("supervise.execute.make_plan", refuse)
+    out = tmp_path / "there"
+    with pytest.raises(UsageError, match="two tips"):
+        execute(RunOptions(gains=gains, nodes=2, out=out), quiet=True, plot=False)
+    assert not out.exists()
+
+
+def test_two_runs_at_once_into_one_directory(
+    gains: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second one comes before the first one has made a recording, and leaves everything alone."""
+
+    def meanwhile(*_: object) -> None:
+        with pytest.raises(UsageError, match="something in it already"):
+            execute(options, quiet=True, plot=False)
+        assert list(tmp_path.iterdir()) != []
+        raise UsageError("the first one ends")
+
+    options = RunOptions(gains=gains, nodes=2, out=tmp_path)
+    monkeypatch.setattr("supervise.execute.make_plan", meanwhile)
+    with pytest.raises(UsageError, match="the first one ends"):
+        execute(options, quiet=True, plot=False)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("case", ["unknown flag", "one node", "tick too long"])
