@@ -45,15 +45,22 @@ def run_study(
     """Run one of `STUDIES`; JSON and plot go to <out>/<name>.json and .png.
 
     Raises UsageError for a choice that the study does not offer or a file that cannot be written, and
-    what `read_artefact` raises. Files appear whole or not at all.
+    what `read_artefact` raises. Files appear whole or not at all, and no empty directory is left.
     """
     module = importlib.import_module(f"analysis.study.{name}")
     keywords = keywords_of(name, module.run, choices)
+    made = out is not None and not out.exists()
     targets = _targets(name, module, out, force)
-    found = module.run(read_artefact(gains), progress, **keywords)
-    found = {"study": name, "gains": str(gains), **found}
-    for target in targets:
-        _write(target, module, found)
+    try:
+        found = module.run(read_artefact(gains), progress, **keywords)
+        found = {"study": name, "gains": str(gains), **found}
+        for target in targets:
+            _write(target, module, found)
+    except BaseException:
+        if made and out is not None:
+            with suppress(OSError):  # what is not empty stays
+                out.rmdir()
+        raise
     return Study(finite(found), module.table(found), targets)
 
 
@@ -78,6 +85,8 @@ def keywords_of(name: str, run: Callable[..., Any], choices: Choices) -> dict[st
         several = isinstance(offered[option].default, tuple | list)
         if len(values) > 1 and not several:
             raise UsageError(f"--{option}: the study of {name} takes one, got {len(values)}")
+        if option == "jobs" and min(values) < 1:
+            raise UsageError(f"--jobs: expected at least 1, got {min(values)}")
         keywords[offered[option].name] = values if several else values[0]
     return keywords
 

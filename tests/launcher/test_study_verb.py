@@ -8,6 +8,7 @@ import signal
 import sys
 import types
 from collections.abc import Callable
+from inspect import signature
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 from unittest import mock
@@ -15,7 +16,7 @@ from unittest import mock
 import pytest
 
 import launcher
-from supervise.studying import STUDIES
+from supervise.studying import STUDIES, keywords_of
 from wire.artefact import GainsArtefact
 from wire.errors import UsageError
 
@@ -136,6 +137,26 @@ def test_a_study_that_fails_leaves_no_half_file(
         assert octarm("baselines", "--out", tmp_path) == 2
     assert "no picture" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["baselines.json"]
+
+
+def test_a_study_that_is_refused_leaves_no_directory(
+    octarm: Callable[..., object], tmp_path: Path
+) -> None:
+    there = tmp_path / "there"
+    there.mkdir()
+    failing = mock.Mock(side_effect=UsageError("no such setpoint"), __signature__=signature(run))
+    with mock.patch.dict(vars(sys.modules["analysis.study.baselines"]), {"run": failing}):
+        assert octarm("baselines", "--out", tmp_path / "new") == 2
+        assert octarm("baselines", "--out", there) == 2
+    assert list(tmp_path.iterdir()) == [there]
+
+
+def test_jobs_are_counted_from_one() -> None:
+    def parallel(*, jobs: int | None = None) -> None: ...
+
+    assert keywords_of("robustness", parallel, {"jobs": (2,)}) == {"jobs": 2}
+    with pytest.raises(UsageError, match="--jobs: expected at least 1, got 0"):
+        keywords_of("robustness", parallel, {"jobs": (0,)})
 
 
 def test_the_verb_offers_what_there_is() -> None:
