@@ -169,37 +169,41 @@ def solve_hinf(
 ) -> HinfResult:
     """Solve the LPI in the three stages of `Stages`, with more polynomials a state until gamma is near enough.
 
-    Returns the result with its verdict; a failed solve gives outcome 'infeasible' or 'unreliable', never
-    an exception.
+    Returns the result with its verdict; a failed solve leaves what the solves before it gave, and if there is
+    nothing the outcome is 'infeasible' or 'unreliable', never an exception.
     """
     stages = stages or Stages()
     start = time.perf_counter()
     nothing = PIOperator.zeros(problem.T.shape_out, problem.T.shape_out)
     found = (float("nan"), float("nan"), nothing, nothing)
-
-    def run(objective: cp.Expression, **fixed: float) -> Solution:
-        return program.solve(objective, fixed, solver, time_limit_s)
+    program: MomentProgram | None = None
+    best = Solution("no moments", float("-inf"), 0, 0.0)
+    sizes: tuple[int, ...] = ()
 
     for count in counts:
-        program = MomentProgram(problem, make_moments(problem, count))
-        best = run(program.gamma, delta=stages.small_delta)
-        sizes = tuple(int(m.shape[0]) for m in program.matrices)
-        if best.status not in ACCEPTED:
-            progress(f"{count} polynomials a state, matrices {sizes}: {best.status}")
+        attempt = MomentProgram(problem, make_moments(problem, count))
+        first = attempt.solve(attempt.gamma, {"delta": stages.small_delta}, solver, time_limit_s)
+        shapes = tuple(int(m.shape[0]) for m in attempt.matrices)
+        head = f"{count} polynomials a state, matrices {shapes}"
+        if not _sound(first):
+            progress(f"{head}: {first.status}")
+            if program is None:
+                best, sizes = first, shapes
             continue
-        found = _found(program)
+        program, best, sizes, found = attempt, first, shapes, _found(attempt)
         least = found[0]
-        progress(f"{count} polynomials a state, matrices {sizes}: smallest gamma {least:.4f}")
+        progress(f"{head}: smallest gamma {least:.4f}")
         if least * (1.0 + stages.slack) <= stages.near:
             break
-    if best.status in ACCEPTED:
+    if program is not None:
         gamma = max(found[0] * (1.0 + stages.slack), stages.aim)
         progress(f"designing for {gamma:.4f}")
-        second = run(-program.delta, gamma=gamma)
-        if second.status in ACCEPTED:
+        second = program.solve(-program.delta, {"gamma": gamma}, solver, time_limit_s)
+        if _sound(second):
             best, found = second, _found(program)
-            third = run(program.z_norm, gamma=gamma, delta=stages.keep * found[1])
-            if third.status in ACCEPTED:
+            fixed = {"gamma": gamma, "delta": stages.keep * found[1]}
+            third = program.solve(program.z_norm, fixed, solver, time_limit_s)
+            if _sound(third):
                 best, found = third, _found(program)
         progress(f"delta {found[1]:.3f}")
     gamma, delta, P, Z = found
@@ -223,5 +227,8 @@ def _verdict(best: Solution) -> str:
     """What the solver's numbers, recomputed, allow to say; the gain itself is judged by lpi_eigenvalue."""
     if best.status in ("infeasible", "infeasible_inaccurate"):
         return "infeasible"
-    sound = best.status in ACCEPTED and best.smallest_eigenvalue >= -EIGENVALUE_TOLERANCE
-    return "certified" if sound else "unreliable"
+    return "certified" if _sound(best) else "unreliable"
+
+
+def _sound(solution: Solution) -> bool:
+    return solution.status in ACCEPTED and solution.smallest_eigenvalue >= -EIGENVALUE_TOLERANCE

@@ -43,8 +43,8 @@ EXTRA_OUTPUTS = 4
 class Moments:
     """Coordinates: m moments of x, each of one state and one orthonormal polynomial; r of the outputs.
 
-    state (m,): the state that a moment is of. h, rates (k, m): <h, x> for h of norm one, and the combination
-    of <phi, x> that is <h, x>_t / size; size (k,): 1 / the factor, so that <h, x>_t = rates x / size.
+    state (m,): the state that a moment is of. h, rates (k, m): <h, x> for k orthonormal h, and what they
+    differentiate to, size <h, x>_t = rates x; size (k,): how long h is for polynomials phi of length one.
     B, SB (w, m); C1 (z, m); outputs (r, m): the moments of C2 x; output (r,): which output each is of.
     x_span (p, m), y_span (s, r): what the part of Z that is no multiplier maps to and from.
     """
