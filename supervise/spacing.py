@@ -59,7 +59,7 @@ def _read(text: str) -> list[float]:
             f"{LARGEST_FILE} bytes"
         )
     numbers: list[float] = []
-    for place, line in enumerate(content.decode(errors="replace").splitlines(), 1):
+    for place, line in enumerate(content.decode("utf-8-sig", errors="replace").splitlines(), 1):
         numbers += _numbers(line.partition("#")[0], f", line {place}", text)
     return numbers
 

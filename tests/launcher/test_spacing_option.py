@@ -25,6 +25,8 @@ def test_a_list_is_typed_or_read_from_a_file(tmp_path: Path) -> None:
     file = tmp_path / "graded.txt"
     file.write_text("# m, root to tip\n0, 0.25\n0.5   1 # tip\n\n")
     assert parse_spacing(str(file), 3) == expected
+    file.write_text("0, 0.25\r\n0.5, 1\r\n", encoding="utf-8-sig")  # as some editors save it
+    assert parse_spacing(str(file), 3) == expected
     assert spacing_name(expected) == "given"
 
 
