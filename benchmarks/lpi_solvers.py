@@ -4,7 +4,7 @@ Programs: reference problems at degrees 2 and 3, as the engine states them, trac
 
 - dual: a linear matrix inequality with one variable per equality, the Gram matrices come back as dual values.
   Through CVXPY that is what ships; `direct` hands the same numbers to the solver's own interface.
-- primal: Gram matrices as variables under equalities (design.semidefinite).
+- primal: Gram matrices as variables under equalities.
 
 Each run has a process of its own. gamma is what the solver's point says, certified what P and Z made from that
 point prove (an operator composition, design.lpi.inequality). Solvers that are not installed are named and left
@@ -25,6 +25,7 @@ import multiprocessing
 import os
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -182,22 +183,36 @@ def through_cvxpy(case: Case, run: Run, limit_s: float, solver: str) -> Run:
 
 def primal_form(case: Case, run: Run, limit_s: float, solver: str) -> Run:
     """Gram matrices as the variables, through CVXPY; traces are not bounded."""
-    from design.semidefinite import ACCEPTED, Layout, Program
+    import cvxpy as cp
 
-    layout = case.program.layout
-    sizes = zip(layout.grams, case.program.gram_sizes, strict=True)
-    present = tuple((name, size) for (name, _), size in sizes if size)
-    program = Program(case.rows(), Layout(layout.numbers, layout.free, present))
-    solution = program.solve(
-        lambda numbers, _: numbers["gamma"], FIXED, solver=solver, time_limit_s=limit_s
-    )
-    run = replace(
-        run, status=solution.status, seconds=solution.seconds, iterations=solution.iterations
-    )
-    if solution.status not in ACCEPTED:
+    from design.semidefinite import ACCEPTED, TIME_LIMITS, orthonormal_equalities
+
+    layout, present = case.program.layout, case.program.gram_sizes
+    numbers = {name: cp.Variable() for name in layout.numbers}
+    grams = [cp.Variable((k, k), symmetric=True) if k else None for k in present]
+    columns = [cp.hstack(list(numbers.values())), cp.Variable(layout.free)]
+    for gram, k in zip(grams, present, strict=True):
+        if gram is not None:
+            i, j = np.triu_indices(k)
+            columns.append(cp.vec(gram, order="F")[i + j * k])
+    rows = orthonormal_equalities(case.rows())
+    constraints = [rows[:, 0] + rows[:, 1:] @ cp.hstack(columns) == 0]
+    constraints += [gram >> 0 for gram in grams if gram is not None]
+    constraints += [numbers[name] == value for name, value in FIXED.items()]
+    program = cp.Problem(cp.Minimize(numbers["gamma"]), constraints)
+    start = time.perf_counter()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # 'may be inaccurate': the status says so
+            program.solve(solver=solver, **{TIME_LIMITS[solver]: limit_s})
+        status = str(program.status)
+    except cp.error.SolverError:
+        status = "solver_error"
+    run = replace(run, status=status, seconds=time.perf_counter() - start)
+    if status not in ACCEPTED:
         return run
-    grams = [solution.grams.get(name, np.zeros((0, 0))) for name, _ in layout.grams]
-    return case.judge(run, grams)
+    run = replace(run, iterations=int(program.solver_stats.num_iters or 0))
+    return case.judge(run, [np.zeros((0, 0)) if g is None else np.asarray(g.value) for g in grams])
 
 
 def clarabel_direct(case: Case, run: Run, limit_s: float, settings: dict[str, Any]) -> Run:

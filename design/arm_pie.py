@@ -11,8 +11,7 @@ With G v = (alpha t.v', (n.v')') and strains s = (e, k) the arm and its adjoint 
 with V = G^-1 and g = N', the viscous part included. The retardation time tau of the Kelvin-Voigt damping
 is in T, not in A, and with tau > 0 the two systems differ in T: a problem of the arm is posed with
 (`T`, `A`, `inverse()`), its adjoint with (`T_adjoint`, `A_adjoint`, `inverse(adjoint=True)`), always as
-x = T f and x_t = A f. T then has a multiplier on the strains, and what dissipates, tau |(p, q)|^2, is
-no form in x: an inequality in rows needs the rows `strain_rates` of f (theory, section 3, point 1).
+x = T f and x_t = A f. T then has a multiplier on the strains; <x, x_t> = -d |v|^2 - tau |(p, q)|^2.
 """
 
 from __future__ import annotations
@@ -75,11 +74,6 @@ class ArmPIE:
         """f -> x_t of the adjoint system, x = T_adjoint f (theory, 3, 'Controller without the trap')."""
         return self.dissipative - self.conservative
 
-    @property
-    def strain_rates(self) -> PIOperator:
-        """f -> (p, q), in which Kelvin-Voigt damping dissipates: <T f, A f> = -d |v|^2 - tau |(p, q)|^2."""
-        return PIOperator.identity(Shape(0, 4)).rows([], [0, 1])
-
     def command(self, actuator: str) -> PIOperator:
         """x -> the velocity that does work with the command: v_y, or n.v for a normal force.
 
@@ -99,11 +93,11 @@ class ArmPIE:
         return PIOperator.multiplier(np.diag([1.0 / self.alpha, 1.0])[:, :, None])
 
     def inverse(self, *, adjoint: bool = False) -> PIOperator:
-        """y = A^-1 x on the primary states (4 -> 4), or of the adjoint dynamics: the Krylov operator.
+        """y = A^-1 x on the primary states (4 -> 4), or of the adjoint dynamics.
 
         A y = x reads, with K sc the map from strains (e, k) to displacement:
         y_v = +-K sc (e, k) and y_s = -+ sc K* (v + d y_v) - tau (e, k). It follows that y_t = x along the
-        dynamics, so rows built with it differentiate to rows already present (theory, section 3, point 1).
+        dynamics, so moments of y differentiate to moments of x (`design.moments`).
         """
         sign = -1.0 if adjoint else 1.0
         to_displacement = self.virtual @ self._compliance

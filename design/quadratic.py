@@ -245,18 +245,6 @@ def unit_rows(rows: PIOperator) -> PIOperator:
     )
 
 
-def function_span(columns: list[Array], tolerance: float = 1e-7) -> Array:
-    """Orthonormal basis, constant first, of the span of scalar polynomials; shape (count, degree + 1)."""
-    size = max(c.size for c in columns)
-    stacked = np.array([np.pad(c, (0, size - c.size)) for c in columns])
-    norms = np.linalg.norm(stacked, axis=1)
-    stacked = stacked[norms > tolerance] / norms[norms > tolerance][:, None]
-    constant = np.eye(1, size)
-    rest = stacked - stacked[:, :1] * constant
-    _, values, vectors = np.linalg.svd(rest, full_matrices=False)
-    return np.concatenate([constant, vectors[values > tolerance]])
-
-
 class _Entries:
     """The entries of rows that are not zero, as one PI operator between functions of one component.
 
@@ -339,7 +327,6 @@ __all__ = [
     "FormTable",
     "coefficient_matrix",
     "forms",
-    "function_span",
     "lifted",
     "unit_rows",
     "weighted",

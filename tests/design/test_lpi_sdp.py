@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from design.lpi.sdp import GramProgram, Point
-from design.semidefinite import Layout, Program
+from design.semidefinite import Layout
 
 Array = npt.NDArray[np.float64]
 
@@ -116,16 +116,25 @@ def test_dual_form_equals_the_direct_form() -> None:
     known = Known(4)
     matrix, cost, numbers, _ = known.parts
     fixed = {"b": float(numbers[1]) - 0.5}
-    direct = Program(matrix, known.layout).solve(
-        lambda n, _: sum(c * n[name] for name, c in cost.items()), {**fixed, "p": 0.0}
-    )
+    free = cp.Variable(2)
+    variables = {name: cp.Variable() for name in known.layout.numbers}
+    direct = {name: cp.Variable((k, k), symmetric=True) for name, k in known.layout.grams}
+    columns = [cp.hstack(list(variables.values())), free]
+    for name, k in known.layout.grams:
+        i, j = np.triu_indices(k)
+        columns.append(cp.vec(direct[name], order="F")[i + j * k])
+    constraints = [matrix[:, 0] + matrix[:, 1:] @ cp.hstack(columns) == 0]
+    constraints += [gram >> 0 for gram in direct.values()]
+    constraints += [variables[name] == value for name, value in {**fixed, "p": 0.0}.items()]
+    program = cp.Problem(cp.Minimize(sum(c * variables[n] for n, c in cost.items())), constraints)
+    program.solve(solver="CLARABEL")
     point = known.program.solve(cost, {**fixed, "p": 0.0})
-    assert direct.status == point.status == "optimal"
+    assert program.status == point.status == "optimal"
     assert point.numbers["b"] == fixed["b"]  # exactly: it is not moved onto the equalities
-    assert point.numbers["a"] == pytest.approx(direct.numbers["a"], abs=1e-5)
+    assert point.numbers["a"] == pytest.approx(float(variables["a"].value), abs=1e-5)
     assert known.value(point) > known.optimum + 1e-3
     for name in ("G", "H"):
-        np.testing.assert_allclose(point.grams[name], direct.grams[name], atol=1e-3)
+        np.testing.assert_allclose(point.grams[name], direct[name].value, atol=1e-3)
 
 
 def test_scaled_mixed_and_repeated_equalities_change_nothing() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import pytest
-from numpy.polynomial import legendre as plain
 from pi_reference import (
     at,
     function_part,
@@ -23,7 +22,6 @@ from design.quadratic import (
     FormTable,
     coefficient_matrix,
     forms,
-    function_span,
     lifted,
     unit_rows,
     weighted,
@@ -264,38 +262,3 @@ def test_unit_rows_balance_any_row() -> None:
     got = unit_rows(random_operator(np.random.default_rng(5), Shape(0, 6), Shape(1, 3)) * 1e5)
     for i in range(6):
         assert 0.3 < hilbert_schmidt(got.rows([], [i])) < 3.0
-
-
-def gram_of_functions(functions: Array) -> Array:
-    x, w = plain.leggauss(20)
-    sampled = values(0.5 * (x + 1.0), functions.shape[1]) @ functions.T
-    return np.asarray(sampled.T @ (sampled * (0.5 * w)[:, None]))
-
-
-def test_function_span_is_an_orthonormal_basis_of_the_span() -> None:
-    rng = np.random.default_rng(6)
-    basis = rng.normal(size=(3, 6))
-    columns = [
-        *(c for c in rng.normal(size=(5, 3)) @ basis * 1e4),
-        1e-3 * basis[0],
-        rng.normal(size=2),
-    ]
-    span = function_span(columns)
-    # the constant, the three drawn and the linear function; none more
-    assert span.shape == (5, 6)
-    np.testing.assert_allclose(gram_of_functions(span), np.eye(5), atol=1e-12)
-    np.testing.assert_allclose(span[0], np.eye(1, 6)[0], atol=1e-15)
-    for column in columns:
-        wide = np.pad(column, (0, 6 - column.size))
-        np.testing.assert_allclose(
-            wide @ span.T @ span, wide, atol=1e-10 * float(np.linalg.norm(wide))
-        )
-
-
-def test_function_span_of_constants_and_nothing_else() -> None:
-    np.testing.assert_allclose(
-        function_span([np.array([3.0]), np.array([-1.0, 0.0])]), [[1.0, 0.0]]
-    )
-    assert function_span([np.array([0.0, 0.0])]).shape == (1, 2)
-    almost = function_span([np.array([1.0, 1e-9])])
-    assert almost.shape == (1, 2)
