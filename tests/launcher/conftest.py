@@ -76,6 +76,16 @@ class Cli:
                     assert data, f"ended without a line {text!r}:\n{self.err}"
                     self.err += data.decode()
 
+    def wait_for_records(self) -> None:
+        """Wait for the first tick, then until the recorder has written twice: whole ticks are on the disk."""
+        self.wait_for("tick ")
+        limit = time.monotonic() + PATIENCE_S
+        for _ in range(2):
+            size = self.recording().stat().st_size
+            while self.recording().stat().st_size == size:
+                assert time.monotonic() < limit, "the recorder writes nothing"
+                time.sleep(0.02)
+
     def finish(self) -> int:
         """Wait for the end; returns the exit code."""
         out, err = self.popen.communicate(timeout=PATIENCE_S)

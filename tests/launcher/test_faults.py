@@ -67,8 +67,8 @@ def test_killed_plant_stops_the_run(start: Start) -> None:
 
 
 def test_killed_recorder_leaves_a_readable_file(start: Start) -> None:
-    cli = start.run("--nodes", "3", "--ticks", "600", "--no-plot")
-    cli.wait_for("tick ")
+    cli = start.run("--nodes", "3", "--ticks", "2000", "--no-plot")
+    cli.wait_for_records()
     os.kill(cli.processes()["octarm-recorder"], signal.SIGKILL)
     assert cli.finish() == 3
     assert "the recorder was ended by SIGKILL" in cli.err
@@ -77,7 +77,7 @@ def test_killed_recorder_leaves_a_readable_file(start: Start) -> None:
 
 def test_killed_launcher_leaves_nothing_alive(start: Start) -> None:
     cli = start.run(*ENDLESS)
-    cli.wait_for("tick ")
+    cli.wait_for_records()
     os.kill(cli.popen.pid, signal.SIGKILL)
     cli.finish()
     nothing_left(cli)
