@@ -139,10 +139,10 @@ def immediate(monkeypatch: pytest.MonkeyPatch) -> type[Immediate]:
 def test_the_longest_jobs_come_first(tmp_path: Path, immediate: type[Immediate]) -> None:
     run_design(Request(arm(tmp_path, "little", "bent"), tmp_path / "out.json"), work=well)
     assert immediate.order == [
-        "setpoint bent, controller",
-        "setpoint little, controller",
         "setpoint bent, observer",
+        "setpoint bent, controller",
         "setpoint little, observer",
+        "setpoint little, controller",
     ]
 
 
@@ -171,7 +171,7 @@ def test_fresh_takes_nothing(tmp_path: Path, immediate: type[Immediate]) -> None
     assert immediate.order == ["setpoint refuses, controller"]
     path.write_text(arm_text("1"))
     run_design(Request(path, out, fresh=True), work=well)
-    assert immediate.order == ["setpoint 1, controller", "setpoint 1, observer"]
+    assert immediate.order == ["setpoint 1, observer", "setpoint 1, controller"]
 
 
 def test_some_gains_only(tmp_path: Path, immediate: type[Immediate]) -> None:

@@ -95,7 +95,7 @@ def test_frozen_node_is_named_within_the_deadline(start: Start) -> None:
 
 def test_killed_before_the_first_tick(start: Start) -> None:
     """A node that is never started: the launcher says which, and ends everything."""
-    cli = start.run("--nodes", "3", "--ticks", "10", "--by-hand", "1", "--start-timeout", "2")
+    cli = start.run("--nodes", "3", "--ticks", "10", "--by-hand", "1", "--start-timeout", "5")
     assert cli.finish() == 5
     assert "node 1 was not started" in cli.err
     assert "node 0 waits for node 1" in cli.err

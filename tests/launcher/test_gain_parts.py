@@ -96,7 +96,7 @@ def test_a_part_belongs_to_the_data_that_its_gain_depends_on(change: str, tmp_pa
 
 
 @pytest.mark.parametrize(
-    "options", [{"solver": "SCS"}, {"time_limit_s": 200.0}, {"level": 1}], ids=str
+    "options", [{"solver": "SCS"}, {"time_limit_s": 200.0}, {"counts": (2,)}], ids=str
 )
 def test_a_part_belongs_to_its_options(options: dict[str, Any], tmp_path: Path) -> None:
     file = arm_file(tmp_path)
