@@ -109,11 +109,11 @@ def design_gain(
     if role == "observer":
         factors = observer_factors(gain.factors, arm)
         entry = msgspec.structs.replace(entry, observer=factors)
-        achieved = verify_observer(arm, entry, weight)
+        achieved = verify_observer(arm, entry, weight, optimum)
     else:
         factors = controller_factors(gain.factors.adjoint, arm)
         entry = msgspec.structs.replace(entry, controller=factors)
-        achieved = verify_controller(arm, entry, weight)
+        achieved = verify_controller(arm, entry, weight, optimum)
     _check_achieved(gain.result, achieved, name)
     open_loop_decay = _open_loop_decay(arm, entry.curvature_per_m)
     seconds = time.perf_counter() - start

@@ -106,7 +106,7 @@ def make_moments(problem: HinfProblem, count: int) -> Moments:
 
     places = np.cumsum([0, *map(len, output_bases)])
     test = _assembled(np.eye(places[-1]), output_bases)
-    of_h = _coordinates((problem.C2 @ _columns(h)).q2.swapaxes(0, 1), output_bases)
+    of_h = _coordinates(dual(h, problem.C2.adjoint), output_bases)
     first = _coordinates(_monomials(outputs, count), output_bases)
     return Moments(
         bases=bases,
@@ -136,11 +136,6 @@ def functionals(functions: Array) -> PIOperator:
 def dual(functions: Array, operator: PIOperator) -> Array:
     """operator* f for vectors of polynomials f (k, n, d)."""
     return np.asarray((functionals(functions) @ operator).q1)
-
-
-def _columns(functions: Array) -> PIOperator:
-    """R^k -> the combination of vectors of polynomials (k, n, d)."""
-    return functionals(functions).adjoint
 
 
 def _selected(C2: PIOperator) -> tuple[int, ...] | None:

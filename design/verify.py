@@ -128,17 +128,29 @@ def controller_optimum(arm: Arm, setpoint: Setpoint, effort: float) -> float:
     return riccati_optimum(plant.A, plant.disturbance, plant.outputs, plant.force, effort)
 
 
-def verify_observer(arm: Arm, setpoint: Setpoint, noise: float) -> Achieved:
-    """Figures of the observer gain of a setpoint; `noise` is the weight of the measurement noise."""
-    optimum = observer_optimum(arm, setpoint, noise)
+def verify_observer(
+    arm: Arm, setpoint: Setpoint, noise: float, optimum: float | None = None
+) -> Achieved:
+    """Figures of the observer gain of a setpoint; `noise` is the weight of the measurement noise.
+
+    optimum: that of `observer_optimum` where it is known already, computed if not.
+    """
+    if optimum is None:
+        optimum = observer_optimum(arm, setpoint, noise)
     return _verify(
         arm, setpoint, lambda p, closed: observer_channel(p, noise, closed=closed), optimum
     )
 
 
-def verify_controller(arm: Arm, setpoint: Setpoint, effort: float) -> Achieved:
-    """Figures of the state-feedback gain of a setpoint; `effort` weighs the command in z."""
-    optimum = controller_optimum(arm, setpoint, effort)
+def verify_controller(
+    arm: Arm, setpoint: Setpoint, effort: float, optimum: float | None = None
+) -> Achieved:
+    """Figures of the state-feedback gain of a setpoint; `effort` weighs the command in z.
+
+    optimum: that of `controller_optimum` where it is known already, computed if not.
+    """
+    if optimum is None:
+        optimum = controller_optimum(arm, setpoint, effort)
     return _verify(
         arm, setpoint, lambda p, closed: controller_channel(p, effort, closed=closed), optimum
     )
