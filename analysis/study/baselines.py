@@ -18,6 +18,7 @@ from analysis.study.feedbacks import Feedback, make_feedbacks, state_norm
 from analysis.study.figures import curves
 from analysis.study.loop import (
     Case,
+    chosen_setpoints,
     closed_loop,
     decay_per_s,
     design_weights,
@@ -52,9 +53,7 @@ def run(
     before it: per setpoint, see `make_feedbacks`. Raises UsageError for a setpoint that does not
     exist or packages that are not installed, OctarmError if they fail.
     """
-    names = list(setpoints) or [setpoint.name for setpoint in artefact.setpoints]
-    for name in names:
-        artefact.setpoint_index(name)
+    names = chosen_setpoints(artefact, setpoints)
     deployment = deploy(artefact, nodes, tick_s)
     rows: list[dict[str, Any]] = []
     optimum, hinfsyn = {}, {}

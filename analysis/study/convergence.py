@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from analysis.study.continuum import POINTS
+from analysis.study.loop import chosen_setpoints
 from analysis.study.refinement import QUANTITIES, Choices, Limit, grid_errors, limit
 from analysis.study.workers import call_all
 from deploy import Spacing
@@ -66,9 +67,7 @@ def run(
     Raises UsageError for a choice that does not exist or fit.
     """
     counts = sorted(set(nodes))
-    names = list(dict.fromkeys(setpoints)) or [s.name for s in artefact.setpoints]
-    for name in names:
-        artefact.setpoint_index(name)
+    names = chosen_setpoints(artefact, list(dict.fromkeys(setpoints)))
     _check(counts, spacings, ticks, initial)
     for weight in ("measurement_noise", "control_effort"):
         if weight not in artefact.weights:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -237,6 +238,14 @@ def design_weights(artefact: GainsArtefact) -> tuple[float, float]:
             )
     noise, effort = (artefact.weights[key] for key in keys)
     return noise, effort
+
+
+def chosen_setpoints(artefact: GainsArtefact, names: Sequence[str]) -> list[str]:
+    """The names, or all of the artefact's if there are none; UsageError for one that does not exist."""
+    chosen = list(names) or [setpoint.name for setpoint in artefact.setpoints]
+    for name in chosen:
+        artefact.setpoint_index(name)
+    return chosen
 
 
 def loop_channel(

@@ -22,6 +22,7 @@ from analysis.study.loop import (
     GROWTH_PER_S,
     Case,
     Rest,
+    chosen_setpoints,
     closed_loop,
     decay_per_s,
     design_weights,
@@ -85,9 +86,7 @@ def run(
     actuators the worst node's; all nodes' in "each_node". The keys of a row: `_evaluate`. Raises UsageError for
     a setpoint that does not exist or a deployment that is refused.
     """
-    names = list(setpoints) or [setpoint.name for setpoint in artefact.setpoints]
-    for name in names:
-        artefact.setpoint_index(name)
+    names = chosen_setpoints(artefact, setpoints)
     if ticks < 10:
         raise UsageError(f"robustness: expected at least 10 ticks, got {ticks}")
     design_weights(artefact)
