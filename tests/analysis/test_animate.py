@@ -4,10 +4,10 @@ import dataclasses
 import itertools
 import json
 import math
-import signal
 from pathlib import Path
 from unittest import mock
 
+import in_process
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -15,7 +15,6 @@ from PIL import Image
 from scipy.integrate import solve_ivp
 from simulated_run import Scenario, make_artefact, write_recording
 
-import launcher
 from analysis.animate import Film, animate, choose_ticks
 from analysis.estimated_arm import Near, arm_curve
 from analysis.goals import COLOURS, colour, sectors
@@ -201,14 +200,7 @@ def test_too_many_frames_are_refused(recording: Recording) -> None:
 
 def octarm(*arguments: str | Path) -> object:
     """`octarm animate` in this process; its exit code."""
-    before = signal.getsignal(signal.SIGTERM)
-    with (
-        mock.patch("sys.argv", ["octarm", "animate", *map(str, arguments)]),
-        pytest.raises(SystemExit) as end,
-    ):
-        launcher.main()
-    signal.signal(signal.SIGTERM, before)
-    return end.value.code
+    return in_process.octarm("animate", *arguments)
 
 
 def test_the_verb_takes_a_directory_and_writes_over_nothing_unasked(

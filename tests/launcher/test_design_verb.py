@@ -6,7 +6,6 @@ import fcntl
 import inspect
 import json
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import in_process
 import pytest
 from stand_in_gains import Immediate, arm, arm_text, well
 
@@ -50,20 +50,12 @@ def test_output_that_cannot_be_written(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def octarm(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], *arguments: str | Path
-) -> tuple[object, str, str]:
+def octarm(capfd: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[object, str, str]:
     """`octarm design` in this process: exit code, standard output, standard error."""
-    monkeypatch.setattr("sys.argv", ["octarm", "design", *map(str, arguments)])
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        with pytest.raises(SystemExit) as end:
-            launcher.main()
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    code = in_process.octarm("design", *arguments)
     out, err = capfd.readouterr()
     assert "Traceback" not in out + err
-    return end.value.code, out, err
+    return code, out, err
 
 
 WRONG = {
@@ -89,7 +81,7 @@ def test_wrong_argument(
 ) -> None:
     arguments, culprit = WRONG[case]
     monkeypatch.chdir(tmp_path)
-    code, out, err = octarm(monkeypatch, capfd, *arguments)
+    code, out, err = octarm(capfd, *arguments)
     assert (code, out) == (2, "")
     assert culprit in err
     assert list(tmp_path.iterdir()) == []
@@ -105,16 +97,11 @@ BAD = {
 
 @pytest.mark.usefixtures("idle")
 @pytest.mark.parametrize("case", BAD)
-def test_bad_arm_file(
-    case: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+def test_bad_arm_file(case: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     text, culprit = BAD[case]
     bad = tmp_path / "bad.toml"
     bad.write_text(text)
-    code, out, err = octarm(monkeypatch, capfd, "--arm", bad, "--out", tmp_path / "out.json")
+    code, out, err = octarm(capfd, "--arm", bad, "--out", tmp_path / "out.json")
     assert (code, out) == (2, "")
     assert "bad.toml" in err
     assert culprit in err
@@ -134,7 +121,7 @@ def verb(
     monkeypatch.setattr(designing.run_design, "__defaults__", (lambda _: None, well, 1.0))
 
     def run(*arguments: str | Path) -> tuple[object, str, str]:
-        return octarm(monkeypatch, capfd, "--arm", path, *arguments)
+        return octarm(capfd, "--arm", path, *arguments)
 
     return run
 
@@ -197,11 +184,11 @@ def test_every_choice_reaches_the_design(
 
     monkeypatch.setattr(designing, "run_design", refuse)
     code, out, err = octarm(
-        monkeypatch, capfd, "--arm", "a.toml", "--out", "b.json", "--jobs", "3", "--solver", "SCS",
+        capfd, "--arm", "a.toml", "--out", "b.json", "--jobs", "3", "--solver", "SCS",
         "--time-limit", "7", "--fresh", "--force", "--only", "1", "2:observer",
     )  # fmt: skip
     assert (code, out, err) == (6, "", "working\noctarm: setpoint 1, observer: no\n")
-    octarm(monkeypatch, capfd, "--arm", "mine/my.arm.toml")
+    octarm(capfd, "--arm", "mine/my.arm.toml")
     assert asked == [
         Request(
             Path("a.toml"),

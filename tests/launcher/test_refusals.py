@@ -3,14 +3,13 @@ traceback."""
 
 from __future__ import annotations
 
-import signal
 import socket
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import in_process
 import pytest
 
-import launcher
 from supervise.execute import execute
 from supervise.options import RunOptions
 from wire.errors import UsageError
@@ -67,16 +66,9 @@ def test_wrong_option(
     """In this process, for speed: no process is started before every option is checked."""
     arguments, code, culprit = WRONG[case]
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.argv", ["octarm", "run", "--gains", str(gains), *arguments])
     monkeypatch.setattr("subprocess.Popen", _nothing_may_start)
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        with pytest.raises(SystemExit) as end:
-            launcher.main()
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    assert in_process.octarm("run", "--gains", gains, *arguments) == code
     out, err = capfd.readouterr()
-    assert end.value.code == code
     assert culprit in err
     assert "Traceback" not in err
     assert out == ""
@@ -85,16 +77,9 @@ def test_wrong_option(
 
 @pytest.mark.parametrize("verb", [["deploy", "--out"], ["animate"]])
 def test_a_name_that_is_too_long_for_a_file(
-    verb: list[str], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    verb: list[str], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("sys.argv", ["octarm", *verb, "x" * 5000])
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        with pytest.raises(SystemExit) as end:
-            launcher.main()
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    assert end.value.code == 2
+    assert in_process.octarm(*verb, "x" * 5000) == 2
     assert capfd.readouterr().err.endswith("xxx: File name too long\n")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import signal
 import sys
 import types
 from collections.abc import Callable
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 from unittest import mock
 
+import in_process
 import pytest
 
 import launcher
@@ -53,12 +53,7 @@ def octarm(monkeypatch: pytest.MonkeyPatch) -> Callable[..., object]:
     seen.clear()
 
     def call(*arguments: str | Path) -> object:
-        before = signal.getsignal(signal.SIGTERM)
-        monkeypatch.setattr("sys.argv", ["octarm", "study", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            launcher.main()
-        signal.signal(signal.SIGTERM, before)
-        return end.value.code
+        return in_process.octarm("study", *arguments)
 
     return call
 
