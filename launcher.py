@@ -52,6 +52,11 @@ def run(
     start_timeout: float = RunOptions.start_timeout_s,
     deadline: float = RunOptions.deadline_s,
     by_hand: Ints = RunOptions.by_hand,
+    realtime: Flag = RunOptions.realtime,
+    period: float | None = RunOptions.period_s,
+    hold_ticks: int = RunOptions.hold_ticks,
+    segments_per_process: int = RunOptions.segments_per_process,
+    sched: Literal["other", "fifo"] = "other",
     no_pin: Flag = False,
 ) -> int:
     """Run the arm: one process a segment, a plant and a recorder; leaves a recording and a plot.
@@ -85,6 +90,12 @@ def run(
         start_timeout: Seconds until every link must be up.
         deadline: Longest wait within a tick, in seconds, before the run is stopped.
         by_hand: A node that you start yourself; may be given several times.
+        realtime: Let the clock say when a tick begins, instead of as soon as the one before is done.
+        period: Seconds between two ticks, wall clock, with --realtime; default: the tick.
+        hold_ticks: So many ticks in a row may be late, with --realtime, the last commands held; then the arm
+            goes safe and the run ends with exit code 4.
+        segments_per_process: Several segments in one process hand their sums on in memory.
+        sched: Scheduling of plant and nodes: other (ordinary) or fifo (real-time, where it is permitted).
         no_pin: Leave the nodes' cores to the scheduler.
     """
     from supervise.execute import execute
@@ -112,6 +123,11 @@ def run(
         deadline_s=deadline,
         by_hand=by_hand,
         pin=not no_pin,
+        fifo=sched == "fifo",
+        segments_per_process=segments_per_process,
+        realtime=realtime,
+        period_s=period,
+        hold_ticks=hold_ticks,
     )
     result = execute(options, quiet=quiet or json, plot=not no_plot)
     outcome = result.outcome

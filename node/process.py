@@ -10,20 +10,17 @@ from __future__ import annotations
 
 import gc
 import math
-import os
 import traceback
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from threading import Lock
 from time import monotonic_ns
 from typing import Any
 
-import numpy as np
-
+from node.block import NotFiniteError, SegmentBlock, Y
 from node.scheduling import Sectors
-from node.segment import NotFiniteError, Segment
-from node.sweep import NodeSweep
+from node.sweep import Array, NodeSweep, Numbers
 from wire import session as zsession
-from wire.channels import COMMAND, MEASUREMENT, SCHEDULE, STATE
 from wire.child import Child, Deadline
 from wire.counters import Flow, Rejections
 from wire.errors import ExitCode
@@ -31,48 +28,39 @@ from wire.factors import NodeFactors
 from wire.keys import Keys
 from wire.messages import (
     PLANT,
+    Incoming,
     Kind,
-    Numbers,
+    Outgoing,
+    Reason,
     RejectedError,
     Stop,
-    decode_numbers,
     decode_stop,
     encode_batch,
     encode_counters,
-    encode_numbers,
+    numbers_of,
     run_tag,
 )
+from wire.placement import place
 from wire.reference import Reference
-from wire.run_config import NodeConfig
+from wire.run_config import NodeConfig, SegmentConfig
 
-BATCH_NS = 250_000_000
-"""Telemetry does not wait longer than this for a batch to fill, while ticks go on."""
 PLANT_PATIENCE = 3.0
 """Between two ticks a node waits this many deadlines: the plant, which has its own, should speak
 first."""
-OWN = len(MEASUREMENT) + len(STATE) + len(COMMAND) + len(SCHEDULE)
-"""Numbers of a telemetry row before the sums."""
 FAREWELL_S = 5.0
 """A node started by hand stays this long after the end, so that its last batch gets through."""
 
 
 class NodeProcess:
-    """One node from its configuration to its exit code; `run` does everything."""
+    """One node from its configuration to its exit code; `run` does everything. It is the block's outlet."""
 
     def __init__(self, config: NodeConfig, child: Child, *, supervised: bool) -> None:
         self._config = config
         self._child = child
         self._supervised = supervised
         self._keys = Keys(run_tag(config.run_id))
-        factors = NodeFactors.from_plain(config.factors)
-        reference = Reference.from_plain(config.reference)
-        sweep = NodeSweep(
-            factors,
-            config.setpoint,
-            reference=reference,
-            sectors=Sectors.of(config.scheduling),
-            fade=math.exp(-reference.tick_s / config.scheduling.bump_s),
-        )
+        sweeps = [_sweep(config, segment) for segment in config.segments]
+        first, last = sweeps[0], sweeps[-1]
         self._lock = Lock()
         self._stop: Stop | None = None
         self._failure: tuple[str, str] | None = None
@@ -81,38 +69,44 @@ class NodeProcess:
         self._sent = {name: Flow() for name in names}
         self._telemetry = Flow()
         self._rejections = Rejections()
-        self._lengths = {
-            "measurement": [2] * len(factors.setpoints),
-            "forward": [factors.forward_received] * len(factors.setpoints),
-            "backward": [factors.backward_received] * len(factors.setpoints),
+        run = self._keys.run
+        self._outgoing = {
+            "forward": Outgoing(Kind.FORWARD_SUM, run, last.index, last.forward_sent),
+            "backward": Outgoing(Kind.BACKWARD_SUM, run, first.index, first.backward_sent),
+            "command": Outgoing(Kind.COMMAND, run, first.index, len(sweeps)),
+        }
+        self.forward = self._outgoing["forward"].values
+        self.backward = self._outgoing["backward"].values
+        self.commands = self._outgoing["command"].values
+
+        def incoming(kind: Kind, sender: int, numbers: int) -> Incoming:
+            return Incoming(kind, run, sender, [numbers] * first.setpoints)
+
+        self._incoming = {
+            "measurement": incoming(Kind.MEASUREMENT, PLANT, Y * len(sweeps)),
+            "forward": incoming(Kind.FORWARD_SUM, first.index - 1, first.forward_received),
+            "backward": incoming(Kind.BACKWARD_SUM, last.index + 1, last.backward_received),
         }
         self._publishers: dict[str, Any] = {}
         self._subscribers: list[Any] = []
-        self._segment = Segment(
-            sweep,
-            config.nodes,
-            send_forward=self._sender("forward", Kind.FORWARD_SUM),
-            send_backward=self._sender("backward", Kind.BACKWARD_SUM),
-            send_command=self._sender("command", Kind.COMMAND),
-            record=self._record,
+        self._batches: deque[tuple[int, Sequence[Array]]] = deque()
+        self._block = SegmentBlock(
+            sweeps,
+            self,
+            batch=config.batch_ticks,
+            # Nodes send their batches at different ticks, so that the recorder's link sees no bursts.
+            first_batch=1 + (config.index * (config.batch_ticks - 1)) // config.nodes,
+            epoch_ns=config.links.epoch_ns,
         )
-        sums = sweep.forward_received + sweep.backward_received
-        instants = 2 + (config.index > 0) + (config.index < config.nodes - 1)
-        self._rows = np.empty((config.batch_ticks, OWN + sums + instants))
-        self._instants = instants
-        self._filled = 0
-        self._batch_began_ns = 0
-        # Nodes send their batches at different ticks, so that the recorder's link sees no bursts.
-        self._quota = 1 + (config.index * config.batch_ticks) // config.nodes
+        # Bound once: looked up every tick.
+        self.send_forward = self._sender("forward")
+        self.send_backward = self._sender("backward")
+        self.send_commands = self._sender("command")
 
     def run(self) -> ExitCode:
         """Link up, take part in every tick, report, and leave; returns the exit code."""
         config = self._config
-        if config.links.cpu is not None:
-            try:
-                os.sched_setaffinity(0, {config.links.cpu})
-            except OSError as error:  # a container may have taken the core away since
-                self._child.status("note", text=f"not pinned to core {config.links.cpu}: {error}")
+        place(config.links.cpu, config.links.fifo, self._note)
         session = zsession.open_session("peer", config.links.listen, config.links.connect)
         try:
             self._declare(session)
@@ -127,30 +121,28 @@ class NodeProcess:
 
     # -- links ------------------------------------------------------------------------------------
 
+    def _note(self, text: str) -> None:
+        self._child.status("note", text=text)
+
     def _declare(self, session: Any) -> None:
-        index, nodes, keys = self._config.index, self._config.nodes, self._keys
-        control: dict[str, str] = {"command": keys.command(index)}
-        receive = {"measurement": (keys.measurement(index), Kind.MEASUREMENT, PLANT)}
-        if index > 0:
-            control["backward"] = keys.backward(index - 1)
-            receive["forward"] = (keys.forward(index), Kind.FORWARD_SUM, index - 1)
-        if index < nodes - 1:
-            control["forward"] = keys.forward(index + 1)
-            receive["backward"] = (keys.backward(index), Kind.BACKWARD_SUM, index + 1)
-        handlers = {
-            "measurement": self._segment.on_measurement,
-            "forward": self._segment.on_forward,
-            "backward": self._segment.on_backward,
-        }
-        for name, (key, kind, sender) in receive.items():
-            handler = self._receiver(name, kind, sender, handlers[name])
-            self._subscribers.append(session.declare_subscriber(key, zsession.direct(handler)))
+        first, last, keys = self._config.index, self._config.last, self._keys
+        control: dict[str, str] = {"command": keys.command(first)}
+        receive = {"measurement": (keys.measurement(first), self._block.on_measurement)}
+        if first > 0:
+            control["backward"] = keys.backward(first - 1)
+            receive["forward"] = (keys.forward(first), self._block.on_forward)
+        if last < self._config.nodes - 1:
+            control["forward"] = keys.forward(last + 1)
+            receive["backward"] = (keys.backward(last), self._block.on_backward)
+        for name, (key, take) in receive.items():
+            handler = zsession.direct(self._receiver(name, take))
+            self._subscribers.append(session.declare_subscriber(key, handler))
         self._subscribers.append(
             session.declare_subscriber(keys.stop, zsession.direct(self._on_stop))
         )
         for name, key in control.items():
             self._publishers[name] = zsession.control_publisher(session, key)
-        self._publishers["telemetry"] = zsession.telemetry_publisher(session, keys.telemetry(index))
+        self._publishers["telemetry"] = zsession.telemetry_publisher(session, keys.telemetry(first))
         for publisher in self._publishers.values():
             listener = publisher.declare_matching_listener(
                 zsession.observe(lambda _: self._child.wake())
@@ -164,7 +156,7 @@ class NodeProcess:
         far = {
             "command": "the plant",
             "telemetry": "the recorder",
-            "forward": f"node {index + 1}",
+            "forward": f"node {self._config.last + 1}",
             "backward": f"node {index - 1}",
         }
         told: list[str] | None = None
@@ -186,10 +178,10 @@ class NodeProcess:
     # -- the run ----------------------------------------------------------------------------------
 
     def _attend(self) -> None:
-        """Main thread: until stopped, see that no tick takes longer than its deadline."""
+        """Main thread: until stopped, send the records on and see that no tick exceeds its deadline."""
         limit_s = self._config.links.deadline_s
         while not (self._stop or self._failure or self._child.stopping):
-            began, ended = self._segment.began_ns, self._segment.ended_ns
+            began, ended = self._block.began_ns, self._block.ended_ns
             if began:
                 left = limit_s - (monotonic_ns() - began) * 1e-9
             elif ended:
@@ -200,9 +192,10 @@ class NodeProcess:
                 self._late(began)
             else:
                 self._child.wait(left)
+            self._send_batches()
         if self._failure:
             code, text = self._failure
-            self._child.status("failed", code=code, message=text, tick=self._segment.tick)
+            self._child.status("failed", code=code, message=text, tick=self._block.tick)
             # The plant answers with its order to stop; without one the launcher's signal comes.
             patience = Deadline(limit_s)
             while not (self._stop or self._child.stopping or patience.passed):
@@ -214,10 +207,10 @@ class NodeProcess:
 
     def _late(self, began_ns: int) -> None:
         with self._lock:
-            if self._segment.began_ns != began_ns:
+            if self._block.began_ns != began_ns:
                 return  # finished in the meantime
-            missing = self._segment.missing() if began_ns else ["the measurement of the plant"]
-            tick = self._segment.tick
+            missing = self._block.missing() if began_ns else ["the measurement of the plant"]
+            tick = self._block.tick
         limit_s = self._config.links.deadline_s * (1.0 if began_ns else PLANT_PATIENCE)
         self._failure = (
             "deadline",
@@ -229,36 +222,52 @@ class NodeProcess:
         """Send the rest of the telemetry and the counters; tell the launcher where the tick
         stood."""
         with self._lock:
-            tick = self._segment.tick
-            missing = self._segment.missing() if self._segment.began_ns else []
-            self._flush()
-            counters = self._counters()
-            run, index = self._keys.run, self._config.index
-            self._publishers["telemetry"].put(encode_counters(run, tick, index, counters))
+            tick = self._block.tick
+            missing = self._block.missing() if self._block.begun else []
+            self._block.flush()
+        self._send_batches()
+        for index, counters in self._counters().items():
+            raw = encode_counters(self._keys.run, tick, index, counters)
+            self._publishers["telemetry"].put(raw)
         self._child.status("stopped", tick=tick, missing=missing)
 
-    def _counters(self) -> dict[str, int]:
-        out: dict[str, int] = {}
-        for name, flow in self._received.items():
-            out |= flow.report(f"{name}_received")
-        for name, flow in self._sent.items():
-            out |= flow.report(f"{name}_sent")
-        return out | self._telemetry.report("telemetry_sent") | self._rejections.report()
+    def _counters(self) -> dict[int, dict[str, int]]:
+        """Per segment: what it had on the wire at either end, and sums that it got in memory."""
+        indices = range(self._config.index, self._config.last + 1)
+        inner = self._block.passed // max(1, 2 * (len(indices) - 1))
+        ends = {i: (i > indices[0]) + (i < indices[-1]) for i in indices}
+        out = {i: {"passed_messages": ends[i] * inner} for i in indices}
+        first, last = out[indices[0]], out[indices[-1]]
+        received, sent = self._received, self._sent
+        first |= received["measurement"].report("measurement_received")
+        first |= sent["command"].report("command_sent")
+        first |= received["forward"].report("forward_received")
+        first |= sent["backward"].report("backward_sent")
+        last |= received["backward"].report("backward_received")
+        last |= sent["forward"].report("forward_sent")
+        first |= self._telemetry.report("telemetry_sent") | self._rejections.report()
+        return out
+
+    def _send_batches(self) -> None:
+        while self._batches:
+            tick, segments = self._batches.popleft()
+            for index, rows in enumerate(segments, self._config.index):
+                raw = encode_batch(self._keys.run, tick, index, rows)
+                self._publishers["telemetry"].put(raw)
+                self._telemetry.add(raw)
 
     # -- Zenoh's thread ---------------------------------------------------------------------------
 
-    def _receiver(
-        self, name: str, kind: Kind, sender: int, handler: Callable[[Numbers, int], None]
-    ) -> Callable[[bytes], None]:
-        flow, lengths, run = self._received[name], self._lengths[name], self._keys.run
+    def _receiver(self, name: str, take: Callable[[Numbers, int], None]) -> Callable[[bytes], None]:
+        flow, incoming, lock = self._received[name], self._incoming[name], self._lock
+        due = incoming.due
 
         def receive(raw: bytes) -> None:
             at_ns = monotonic_ns()
             try:
-                message = decode_numbers(raw, kind, run, sender, lengths)
-                with self._lock:
-                    handler(message, at_ns)
-                    flow.add(raw)
+                with lock:
+                    take(numbers_of(raw) if due(raw) else self._another(incoming, raw), at_ns)
+                flow.add(raw)
             except RejectedError as error:
                 self._rejections.add(error.reason)
             except NotFiniteError as error:
@@ -268,6 +277,21 @@ class NodeProcess:
                 self._fail("internal", f"node {self._config.index}: {error!r}")
 
         return receive
+
+    def _another(self, incoming: Incoming, raw: bytes) -> Numbers:
+        """A message that is not the one that is due: refused by name, unless a tick was left out."""
+        message, block = incoming.decode(raw), self._block
+        ahead = message.tick - block.tick
+        if 0 < ahead <= self._config.skip_ticks and not block.begun:
+            block.skip_to(message.tick)
+        elif ahead:
+            reason = Reason.STALE if ahead < 0 else Reason.EARLY
+            raise RejectedError(reason, f"expected tick {block.tick}, got {message.tick}")
+        if message.setpoint != block.setpoint:
+            raise RejectedError(
+                Reason.SETPOINT, f"expected {block.setpoint}, got {message.setpoint}"
+            )
+        return message.values
 
     def _fail(self, code: str, text: str) -> None:
         self._failure = self._failure or (code, text)
@@ -281,35 +305,33 @@ class NodeProcess:
             return
         self._child.wake()
 
-    def _sender(self, name: str, kind: Kind) -> Callable[[int, int, list[float]], None]:
-        flow, publishers = self._sent[name], self._publishers
-        run, index = self._keys.run, self._config.index
+    def _sender(self, name: str) -> Callable[[int, int], None]:
+        flow, publishers, outgoing = self._sent[name], self._publishers, self._outgoing[name]
 
-        def send(tick: int, setpoint: int, values: list[float]) -> None:
-            raw = encode_numbers(kind, run, tick, index, setpoint, values)
+        def send(tick: int, setpoint: int) -> None:
+            raw = outgoing.stamped(tick, setpoint)
             publishers[name].put(raw)
             flow.add(raw)
 
         return send
 
-    def _record(self, tick: int, row: list[float]) -> None:
-        rows, filled = self._rows, self._filled
-        rows[filled] = row
-        rows[filled, -self._instants :] -= self._config.links.epoch_ns
-        sent_ns = int(row[-1])
-        if filled == 0:
-            self._batch_began_ns = sent_ns
-        self._filled = filled + 1
-        full = self._filled >= self._quota or tick == self._config.ticks - 1
-        if full or sent_ns - self._batch_began_ns > BATCH_NS:
-            self._flush(next_tick=tick + 1)
-            self._quota = self._config.batch_ticks
+    def begins(self, tick: int, setpoint: int) -> None:
+        """Know the messages of this tick beforehand."""
+        for incoming in self._incoming.values():
+            incoming.expect(tick, setpoint)
 
-    def _flush(self, next_tick: int | None = None) -> None:
-        if self._filled:
-            first = (self._segment.tick if next_tick is None else next_tick) - self._filled
-            rows = self._rows[: self._filled]
-            raw = encode_batch(self._keys.run, first, self._config.index, rows)
-            self._publishers["telemetry"].put(raw)
-            self._telemetry.add(raw)
-            self._filled = 0
+    def recorded(self, tick: int, rows: Sequence[Array]) -> None:
+        """Leave a batch to the main thread: nothing on the way of a tick waits for it."""
+        self._batches.append((tick, rows))
+        self._child.wake()
+
+
+def _sweep(config: NodeConfig, segment: SegmentConfig) -> NodeSweep:
+    reference = Reference.from_plain(segment.reference)
+    return NodeSweep(
+        NodeFactors.from_plain(segment.factors),
+        config.setpoint,
+        reference=reference,
+        sectors=Sectors.of(config.scheduling),
+        fade=math.exp(-reference.tick_s / config.scheduling.bump_s),
+    )

@@ -1,13 +1,14 @@
 """The mathematics of one node in the two sweeps: pure, preallocated, the same in run and replay.
 
-Per tick the process around it builds the input from the estimate, the command and the measurement,
-answers the sums that come from its two neighbours and computes the next estimate and command
-(theory, section 5):
-    x = sweep.input(measurement)
-    c_next = sweep.forward(x, c)         to the tip's side, once c is there (empty at the root)
-    d_previous = sweep.backward(x, d)    to the root's side, once d is there (empty at the tip)
-    sweep.accept(sweep.output(x, c, d))  the state of the next tick
+Per tick the process around it hands on what comes, in any order of the three, and takes the next estimate and
+command (theory, section 5):
+    sweep.input(measurement)         the products of estimate, command and measurement
+    c_next = sweep.forward(c)        to the tip's side, once c is there (empty at the root)
+    d_previous = sweep.backward(d)   to the root's side, once d is there (empty at the tip)
+    sweep.accept(sweep.output())     the state of the next tick
 
+What depends on the input alone is multiplied when the measurement comes, so that a sum that arrives waits for
+one small product only; the order of the additions is the same whatever comes first, and so are the bits.
 Matrices act on the deviation from the reference, out = M (in - in_ref(k)) + out_ref(k+1); which setpoint's
 they are is decided by the tip node (`node.scheduling`). For that the sums are longer than the products: c ends
 with turn and end of the arm so far, d with the setpoint of the next tick.
@@ -20,6 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from node.row import TickRow
 from node.scheduling import CLAMP, ArmEnd, Sectors
 from wire.errors import OctarmError, UsageError
 from wire.factors import (
@@ -40,22 +42,27 @@ CHORD = 2
 """Numbers of a reference behind state and command: x and y from the inner to the outer face, m."""
 MEASURED = [1, 3]
 """Which of the state's components are measured: v_y and k."""
+_AS_ROWS_HAVE_IT = [5, 6, 0, 1, 2, 3, 4]
+"""The factors' input (estimate, command, measurement) in the order of a row: measurement first."""
+_COMMAND = INPUTS - 1
+"""Where a row's input has the command."""
 
 
 class _Products:
-    """The factors of one setpoint as three contiguous matrices over one buffer [c, in, d]."""
+    """The factors of one setpoint, stacked by what they are multiplied with, and where the products go."""
 
     def __init__(self, factors: SweepFactors) -> None:
-        rank_c, rank_d = factors.forward_received, factors.backward_received
-        self.whole = np.zeros(rank_c + INPUTS + rank_d)
-        self.c = self.whole[:rank_c]
-        self.x = self.whole[rank_c : rank_c + INPUTS]
-        self.d = self.whole[rank_c + INPUTS :]
-        self.c_in = self.whole[: rank_c + INPUTS]
-        self.in_d = self.whole[rank_c:]
-        self.forward = np.ascontiguousarray(np.hstack([factors.W, factors.Q]))
-        self.backward = np.ascontiguousarray(np.hstack([factors.R, factors.V]))
-        self.output = np.ascontiguousarray(np.hstack([factors.P, factors.D, factors.U]))
+        of_input = np.vstack([factors.Q, factors.R, factors.D])[:, _AS_ROWS_HAVE_IT]
+        self.of_input = np.ascontiguousarray(of_input)
+        self.of_c = np.ascontiguousarray(np.vstack([factors.W, factors.P]))
+        self.of_d = np.ascontiguousarray(np.vstack([factors.V, factors.U]))
+        c, d = factors.forward_sent, factors.backward_sent
+        self.from_input = np.zeros(c + d + OUTPUTS)
+        self.from_c, self.from_d = np.zeros(c + OUTPUTS), np.zeros(d + OUTPUTS)
+        self.c_of_input, self.c_of_c = self.from_input[:c], self.from_c[:c]
+        self.d_of_input, self.d_of_d = self.from_input[c : c + d], self.from_d[:d]
+        self.out_of_input = self.from_input[c + d :]
+        self.out_of_c, self.out_of_d = self.from_c[c:], self.from_d[d:]
 
 
 def resting_at(factors: SweepFactors) -> Reference:
@@ -72,8 +79,9 @@ class NodeSweep:
     `sectors` is what the tip node decides by; None keeps the setpoint. `fade` is the factor a tick of
     the command's bump, see `output`.
 
-    Arrays returned by the methods are buffers that the next call of the same method overwrites;
-    sums may be arrays or lists. OctarmError if a sum has not as many numbers as the factors ask for.
+    A tick happens in a `row` (`node.row`), which `accept` changes for the next tick's. Arrays returned by
+    the methods are buffers that the next call of the same method overwrites; sums may be arrays or lists.
+    OctarmError if a sum has not as many numbers as the factors ask for.
     """
 
     def __init__(
@@ -93,8 +101,10 @@ class NodeSweep:
         """How many numbers c has."""
         self.backward_received = factors.backward_received
         """How many numbers d has."""
-        self._first = factors.index == 0
-        self._last = factors.index == factors.nodes - 1
+        self.first = factors.index == 0
+        """Whether this is the root's node."""
+        self.last = factors.index == factors.nodes - 1
+        """Whether this is the tip's node."""
         self._bend = factors.bend_m
         self._products = [_Products(one) for one in factors.setpoints]
         self.select(setpoint)
@@ -113,24 +123,43 @@ class NodeSweep:
                 f"{self._now.size}; deploy the gains again"
             )
         self._offset = np.zeros(INPUTS)
+        self._deviation = np.zeros(INPUTS)
         self._aimed = self._now
         self._aim()
-        self._input = np.zeros(INPUTS)
         self._output = np.zeros(OUTPUTS)
         sums = factors.setpoints[0]
-        self._c_next = np.zeros(0 if self._last else sums.forward_sent + FORWARD_EXTRA)
-        self._c_sum = self._c_next[: sums.forward_sent]
-        self._d_previous = np.zeros(0 if self._first else sums.backward_sent + BACKWARD_EXTRA)
-        self._d_sum = self._d_previous[: sums.backward_sent]
-        self._state = np.zeros(OUTPUTS)
-        self.estimate = self._state[:STATES]
-        self._state[:STATES] = factors.initial_estimate[setpoint]
-        self._state[STATES] = factors.initial_command[setpoint]
+        self.forward_sent = 0 if self.last else sums.forward_sent + FORWARD_EXTRA
+        """How many numbers the sum to the tip's side has."""
+        self.backward_sent = 0 if self.first else sums.backward_sent + BACKWARD_EXTRA
+        """How many numbers the sum to the root's side has."""
+        self.send_from(np.zeros(self.forward_sent), np.zeros(self.backward_sent))
+        self.row = TickRow.alone(self.forward_received, self.backward_received)
+        """Where this tick happens."""
+        self._spare = TickRow.alone(self.forward_received, self.backward_received)
+        self.row.state[:STATES] = factors.initial_estimate[setpoint]
+        self.row.state[STATES] = factors.initial_command[setpoint]
+        self._label_row()
+
+    @property
+    def estimate(self) -> Array:
+        """xh_i of the current tick, (4,)."""
+        return self.row.state[:STATES]
 
     @property
     def command(self) -> float:
         """u_i of the current tick, N/m."""
-        return float(self._state[STATES])
+        return float(self.row.state[STATES])
+
+    @property
+    def last_output(self) -> Array:
+        """What `output` gave last, (5,)."""
+        return self._output
+
+    @property
+    def products(self) -> tuple[Array, Array, Array]:
+        """What input, c and d were last multiplied to."""
+        p = self._active
+        return p.from_input, p.from_c, p.from_d
 
     @property
     def setpoint(self) -> int:
@@ -157,58 +186,113 @@ class NodeSweep:
         self._setpoint = setpoint
         self._active = self._products[setpoint]
 
+    def send_from(self, forward: Array, backward: Array) -> None:
+        """Write the sums that go on into these arrays from now on: the payloads of messages, say."""
+        self._c_next, self._d_previous = forward, backward
+        self._c_sum = forward[: max(0, forward.size - FORWARD_EXTRA)]
+        self._d_sum = backward[: max(0, backward.size - BACKWARD_EXTRA)]
+
+    def start_in(self, row: TickRow) -> None:
+        """Let the tick that begins happen in another row."""
+        row.state[:] = self.row.state
+        self.row = row
+        self._label_row()
+
+    # -- a tick -----------------------------------------------------------------------------------
+
     def input(self, measurement: Numbers) -> Array:
-        """The input (7,) of this tick: estimate, command and the measurement (v_y, k)."""
-        self._input[:OUTPUTS] = self._state
-        self._input[OUTPUTS:] = measurement
-        return self._input
+        """Take the measurement (v_y, k): all that depends on this node alone. Returns the input, as a row has
+        it: measurement, estimate, command (7,)."""
+        row, p = self.row, self._active
+        row.y[:] = measurement
+        np.subtract(row.x, self._offset, out=self._deviation)
+        np.dot(p.of_input, self._deviation, out=p.from_input)
+        return row.x
 
-    def forward(self, x: Array, c: Numbers) -> Array:
-        """W c + Q (x - in_ref) and the arm with this segment, for the tip's side; empty at the tip node."""
-        if self._last:
-            return self._c_next
-        p = self._active
-        np.subtract(x, self._offset, out=p.x)
-        self._receive(p.c, c, self.forward_received, "forward")
-        np.dot(p.forward, p.c_in, out=self._c_sum)
-        self._c_next[-FORWARD_EXTRA:] = self._grown(x, c)
-        return self._c_next
+    def take_forward(self, c: Numbers) -> float:
+        """Take the sum from the root's side and multiply it; finite only if all of it and the products are."""
+        row, p = self.row, self._active
+        if len(c) != self.forward_received:
+            raise self._wrong_length("forward", len(c), self.forward_received)
+        row.c[:] = c
+        np.dot(p.of_c, row.c_sum, out=p.from_c)
+        extra: list[float] = row.c[-FORWARD_EXTRA:].tolist()
+        return float(np.add.reduce(p.from_c)) + sum(extra)
 
-    def backward(self, x: Array, d: Numbers) -> Array:
-        """V d + R (x - in_ref) and the next setpoint, for the root's side; empty at the root node."""
-        if self._first:
-            return self._d_previous
+    def take_backward(self, d: Numbers) -> float:
+        """Take the sum from the tip's side and multiply it; finite only if all of it and the products are."""
+        row, p = self.row, self._active
+        if len(d) != self.backward_received:
+            raise self._wrong_length("backward", len(d), self.backward_received)
+        row.d[:] = d
+        np.dot(p.of_d, row.d_sum, out=p.from_d)
+        return float(np.add.reduce(p.from_d)) + float(row.d[-1])
+
+    def forward_sum(self) -> Array:
+        """W c + Q (in - in_ref) and the arm with this segment, after `input` and `take_forward`."""
         p = self._active
-        np.subtract(x, self._offset, out=p.x)
-        self._receive(p.d, d, self.backward_received, "backward")
-        np.dot(p.backward, p.in_d, out=self._d_sum)
-        self._d_previous[-1] = self._decided if self._last else d[-1]
+        if self.first:
+            self._c_sum[:] = p.c_of_input
+        else:
+            np.add(p.c_of_c, p.c_of_input, out=self._c_sum)
+        end, out = self._grown(), self._c_next
+        out[-3], out[-2], out[-1] = end
+        return out
+
+    def backward_sum(self) -> Array:
+        """V d + R (in - in_ref) and the next setpoint, after `input` and `take_backward`."""
+        p = self._active
+        if self.last:
+            self._d_sum[:] = p.d_of_input
+            self._d_previous[-1] = self._decided
+        else:
+            np.add(p.d_of_d, p.d_of_input, out=self._d_sum)
+            self._d_previous[-1] = self.row.d[-1]
         return self._d_previous
 
-    def output(self, x: Array, c: Numbers, d: Numbers) -> Array:
-        """D (x - in_ref) + P c + U d + out_ref: estimate, command (5,) of the next tick.
+    def forward(self, c: Numbers) -> Array:
+        """Take c; the sum for the tip's side, after `input`; empty at the tip node."""
+        if not self.first:
+            self.take_forward(c)
+        return self._c_next if self.last else self.forward_sum()
+
+    def backward(self, d: Numbers) -> Array:
+        """Take d; the sum for the root's side, after `input`; empty at the root node."""
+        if not self.last:
+            self.take_backward(d)
+        return self._d_previous if self.first else self.backward_sum()
+
+    def output(self) -> Array:
+        """D (in - in_ref) + P c + U d + out_ref: estimate, command (5,) of the next tick, once all is taken.
 
         In the first tick after a change of gains the command's deviation from the reference stays what it
         was: what the new gains want differently is the bump, which is faded out.
         """
-        p = self._active
-        np.subtract(x, self._offset, out=p.x)
-        self._receive(p.c, c, self.forward_received, "forward")
-        self._receive(p.d, d, self.backward_received, "backward")
-        np.dot(p.output, p.whole, out=self._output)
+        p, out = self._active, self._output
+        if self.first:
+            np.add(p.out_of_input, p.out_of_d, out=out)
+        else:
+            np.add(p.out_of_input, p.out_of_c, out=out)
+            if not self.last:
+                np.add(out, p.out_of_d, out=out)
         if self._changed:
-            self._next_bump = float(p.x[STATES] - self._output[STATES])
+            self._next_bump = float(self._deviation[_COMMAND] - out[STATES])
         else:
             self._next_bump = self.bump * self._fade
-        self._output[STATES] += self._next_bump
-        self._announced = self._decided if self._last else int(d[-1])
-        if self._last:
-            self._tip = self._grown(x, c)
-        return np.add(self._output, self._then[:OUTPUTS], out=self._output)
+        if self._next_bump:
+            out[STATES] += self._next_bump
+        if self.last:
+            self._announced, self._tip = self._decided, self._grown()
+        else:
+            self._announced = int(self.row.d[-1])
+        return np.add(out, self._then[:OUTPUTS], out=out)
 
-    def accept(self, output: Numbers) -> None:
-        """Make an output (5,) the state: estimate and command of the tick that begins."""
-        self._state[:] = output
+    def accept(self, output: Numbers, row: TickRow | None = None) -> None:
+        """Make an output (5,) the state: estimate and command of the tick that begins, in another row."""
+        if row is None:
+            row, self._spare = self._spare, self.row
+        row.state[:] = output
+        self.row = row
         self.tick += 1
         self.bump = self._next_bump
         self._now, self._then = self._then, self._reference.at(self.tick + 1)
@@ -217,27 +301,44 @@ class NodeSweep:
         self._changed = self._announced != self._setpoint
         if self._changed:
             self.select(self._announced)
-        if self._last:
+        if self.last:
             self._decided = self._sectors.choose(self._decided, self._tip)
+        self._label_row()
+
+    def skip_to(self, tick: int) -> None:
+        """Ticks have passed without a sweep: the estimate keeps its deviation from the reference, the command
+        is the one that is held."""
+        before = self._now
+        self.tick = tick
+        self._now, self._then = self._reference.at(tick), self._reference.at(tick + 1)
+        if self._now is not before:
+            self.estimate[:] += self._now[:STATES] - before[:STATES]
+        if self._aimed is not self._now:
+            self._aim()
+
+    # -- parts ------------------------------------------------------------------------------------
+
+    def _label_row(self) -> None:
+        self.row.schedule[0], self.row.schedule[1] = self._setpoint, self.bump
 
     def _aim(self) -> None:
         """The reference of this tick as an offset of the input: its measurement is part of its state."""
-        self._offset[:OUTPUTS] = self._now[:OUTPUTS]
-        self._offset[OUTPUTS:] = self._now[MEASURED]
+        self._offset[:2] = self._now[MEASURED]
+        self._offset[2:] = self._now[:OUTPUTS]
         self._aimed = self._now
         _, _, self._strain, self._curvature, _, self._chord_x, self._chord_y = self._now.tolist()
 
-    def _grown(self, x: Array, c: Numbers) -> ArmEnd:
+    def _grown(self) -> ArmEnd:
         """The estimated arm up to this segment's outer face."""
-        so_far = CLAMP if self._first else ArmEnd(*map(float, c[-FORWARD_EXTRA:]))
-        turn = (float(x[3]) - self._curvature) * self._bend
-        stretch = (1.0 + float(x[2])) / (1.0 + self._strain)
+        row = self.row
+        so_far = CLAMP if self.first else ArmEnd(*row.c[-FORWARD_EXTRA:].tolist())
+        _, _, strain, curvature, _ = row.state.tolist()
+        turn = (curvature - self._curvature) * self._bend
+        stretch = (1.0 + strain) / (1.0 + self._strain)
         return so_far.grown(turn, stretch, self._chord_x, self._chord_y)
 
-    def _receive(self, buffer: Array, values: Numbers, expected: int, direction: str) -> None:
-        if len(values) != expected:
-            raise OctarmError(
-                f"node {self.index}: {direction} sum of {len(values)} numbers, expected {expected}; all "
-                "nodes must run one deployment"
-            )
-        buffer[:] = values[: len(buffer)]
+    def _wrong_length(self, direction: str, count: int, expected: int) -> OctarmError:
+        return OctarmError(
+            f"node {self.index}: {direction} sum of {count} numbers, expected {expected}; all "
+            "nodes must run one deployment"
+        )

@@ -16,13 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from recorder.merge import Row, TickMerge
+from recorder.merge import Gap, Row, TickMerge
 from recorder.writer import RecordingWriter
 from wire import session as zsession
 from wire.channels import (
     COMMAND,
     MEASUREMENT,
+    PACE,
     STATE,
+    SWEEP_TIMING,
     Channel,
     label,
     node_channels,
@@ -53,6 +55,8 @@ FINISH_S = 10.0
 """How long to wait for the last words of processes that are alive."""
 SETPOINT_AT = len(MEASUREMENT) + len(STATE) + len(COMMAND)
 """Where a node's row has the setpoint whose gains it uses."""
+LATE_AT = -len(SWEEP_TIMING) - len(PACE)
+"""Where the plant's row says whether the tick had no sweep."""
 
 
 class RecorderProcess:
@@ -81,6 +85,8 @@ class RecorderProcess:
         self._written = 0
         self._setpoint = run.setpoint_index
         self._silent: set[int] = set()
+        self._late: set[int] = set()
+        """Ticks that had no sweep: no node has anything to record of them."""
         self._events: list[tuple[int, str, str, str]] = []
         """Events whose tick is not written yet: they go into the file before the ticks that follow
         them."""
@@ -161,6 +167,7 @@ class RecorderProcess:
         for tick, rows in ticks:
             self._tell(tick)
             self._tell_setpoint(tick, rows)
+            self._tell_late(tick, rows)
             self._writer.tick(tick, rows)
             self._last = (tick, rows)
             if tick == 0:
@@ -183,6 +190,14 @@ class RecorderProcess:
         names = self._config.run.setpoint_names
         text = f"setpoint {names[before]} -> {names[self._setpoint]} at tick {tick}"
         self._writer.event(tick, "info", "setpoint", text)
+
+    def _tell_late(self, tick: int, rows: dict[int, Row]) -> None:
+        """Write an event when ticks begin to be late; every one of them is marked in /plant/pace."""
+        if PLANT in rows and rows[PLANT][LATE_AT]:
+            self._late.add(tick)
+            if tick - 1 not in self._late:
+                text = "the sweep of the tick before was not over: the commands are held"
+                self._writer.event(tick, "warning", "late", text)
 
     # -- figures for the progress bar -------------------------------------------------------------
 
@@ -217,6 +232,8 @@ class RecorderProcess:
         self._write(self._merge.rest())
         run = self._config.run
         for gap in self._merge.gaps:
+            if not self._lost(gap):
+                continue
             who = "plant" if gap.sender == PLANT else f"node {gap.sender}"
             text = f"telemetry of {who}: ticks {gap.first} to {gap.after - 1} were lost"
             self._writer.event(gap.first, "warning", "telemetry_lost", text)
@@ -232,6 +249,10 @@ class RecorderProcess:
         self._writer.close(summary)
         self._child.status("closed", **totals)
 
+    def _lost(self, gap: Gap) -> int:
+        """Ticks of a gap that a node has done and the recorder did not get."""
+        return sum(tick not in self._late for tick in range(gap.first, gap.after))
+
     def _totals(self) -> dict[str, int]:
         nodes = [c for sender, c in self._counters.items() if sender != PLANT]
         plant = self._counters.get(PLANT, {})
@@ -241,10 +262,12 @@ class RecorderProcess:
 
         return {
             "ticks_recorded": self._written,
-            "ticks_lost": sum(gap.after - gap.first for gap in self._merge.gaps),
+            "ticks_lost": sum(map(self._lost, self._merge.gaps)),
+            "late_ticks": plant.get("late_ticks", 0),
             "nodes_reporting": len(nodes),
             "neighbour_messages": total("forward_received_messages", "backward_received_messages"),
             "neighbour_bytes": total("forward_received_bytes", "backward_received_bytes"),
+            "passed_messages": total("passed_messages"),
             "neighbour_messages_sent": total("forward_sent_messages", "backward_sent_messages"),
             "measurement_messages": total("measurement_received_messages"),
             "measurement_bytes": total("measurement_received_bytes"),

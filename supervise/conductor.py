@@ -106,9 +106,9 @@ class Conductor:
         began = monotonic()
         self._spawn()
         self._wait_linked(Deadline(self._plan.start_timeout_s))
-        nodes = self._plan.run.nodes
-        self._view.note(f"{nodes} nodes, plant and recorder linked in {monotonic() - began:.2f} s")
-        self._event(0, "info", "started", f"{nodes} nodes linked")
+        nodes = _how_many(self._plan)
+        self._view.note(f"{nodes}, plant and recorder linked in {monotonic() - began:.2f} s")
+        self._event(0, "info", "started", f"{nodes} linked")
         self._order(self._plant, do="start")
         first = monotonic()
         self._watch()
@@ -296,6 +296,11 @@ class Conductor:
 
     def _event(self, tick: int, level: str, name: str, text: str) -> None:
         self._order(self._recorder, do="event", tick=tick, level=level, name=name, message=text)
+
+
+def _how_many(plan: Plan) -> str:
+    nodes, processes = plan.run.nodes, len(plan.nodes)
+    return f"{nodes} nodes" if nodes == processes else f"{nodes} segments in {processes} nodes"
 
 
 def log_of(directory: Path) -> Path:

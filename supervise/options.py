@@ -46,6 +46,12 @@ class RunOptions:
     deadline_s: float = 10.0
     by_hand: tuple[int, ...] = ()
     pin: bool = True
+    fifo: bool = False
+    segments_per_process: int = 1
+    realtime: bool = False
+    period_s: float | None = None
+    """None: the tick, that is one second of the arm's in one of the clock's."""
+    hold_ticks: int = 2
 
     def __post_init__(self) -> None:
         from plant.disturbance import DisturbanceSpec
@@ -64,9 +70,22 @@ class RunOptions:
         _positive("--tick", self.tick_s, "seconds")
         _positive("--start-timeout", self.start_timeout_s, "seconds")
         _positive("--deadline", self.deadline_s, "seconds")
+        _at_least("--segments-per-process", self.segments_per_process, 1, "or there is no node")
+        _at_least("--hold-ticks", self.hold_ticks, 0, "0 stops the arm at the first late tick")
+        if self.segments_per_process >= self.nodes:
+            raise UsageError(
+                f"--segments-per-process {self.segments_per_process}: {self.nodes} segments would be one "
+                f"process, with nobody to talk to; expected at most {self.nodes - 1}"
+            )
+        if self.period_s is not None:
+            _positive("--period", self.period_s, "seconds")
+            if not self.realtime:
+                raise UsageError("--period is for --realtime; add it or leave the period out")
         for node in self.by_hand:
-            if not 0 <= node < self.nodes:
-                raise UsageError(f"--by-hand {node}: expected a node 0..{self.nodes - 1}")
+            if node not in range(0, self.nodes, self.segments_per_process):
+                every = self.segments_per_process
+                which = "" if every == 1 else f", a multiple of {every} (the first segment of each)"
+                raise UsageError(f"--by-hand {node}: expected a node 0..{self.nodes - 1}{which}")
         if self.initial is not None:
             check_name(self.initial)
         amplitude = self.disturbance_amplitude

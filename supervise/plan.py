@@ -29,13 +29,16 @@ from supervise.spacing import spacing_name
 from wire.artefact import GainsArtefact, digest, read_artefact
 from wire.channels import FORMAT_VERSION
 from wire.errors import UsageError
+from wire.placement import FIFO_PRIORITY
 from wire.run_config import (
     LinkConfig,
     NodeConfig,
+    PaceConfig,
     PlantConfig,
     RecorderConfig,
     RunConfig,
     SchedulingConfig,
+    SegmentConfig,
     dumps,
 )
 
@@ -154,6 +157,8 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         ),
         initial_commands_n_per_m=tuple(float(f.initial_command[active]) for f in deployment.nodes),
         energy_weights=tuple(map(tuple, deployment.energy_weights.tolist())),
+        segments_per_process=options.segments_per_process,
+        pace=_pace(options),
     )
     epoch_ns = time.monotonic_ns()
     cores = _cores(nodes) if options.pin else [None] * nodes
@@ -166,32 +171,40 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             deadline_s=options.deadline_s,
             epoch_ns=epoch_ns,
             cpu=cpu,
+            fifo=FIFO_PRIORITY if options.fifo else None,
         )
 
     def node(i: int) -> NodeConfig:
-        listen = [endpoints.nodes[i]] if i < nodes - 1 else []
+        own = range(i, min(i + run.segments_per_process, nodes))
+        listen = [endpoints.nodes[own[-1]]] if own[-1] < nodes - 1 else []
         connect = [endpoints.plant, *([endpoints.nodes[i - 1]] if i > 0 else [])]
         return NodeConfig(
             run_id=run_id,
             index=i,
             nodes=nodes,
-            ticks=run.ticks,
             setpoint=active,
             scheduling=run.scheduling,
             batch_ticks=BATCH_TICKS,
+            skip_ticks=0 if run.pace is None else run.pace.hold_ticks + 1,
             links=links(listen, connect, cores[i]),
-            factors=deployment.nodes[i].to_plain(),
-            reference=references.nodes[i].to_plain(),
+            segments=tuple(
+                SegmentConfig(deployment.nodes[j].to_plain(), references.nodes[j].to_plain())
+                for j in own
+            ),
         )
 
     return Plan(
         run=run,
-        nodes=tuple(node(i) for i in range(nodes)),
+        nodes=tuple(node(i) for i in run.firsts),
         plant=PlantConfig(
             run=run,
             arm=msgspec.to_builtins(artefact.arm),
             setpoint=msgspec.to_builtins(artefact.setpoints[active]),
             reference=references.plant.to_plain(),
+            holding_n_per_m=tuple(
+                tuple(float(f.initial_command[i]) for f in deployment.nodes)
+                for i in range(len(run.setpoint_names))
+            ),
             batch_ticks=BATCH_TICKS,
             links=links([endpoints.plant], []),
         ),
@@ -214,6 +227,13 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         by_hand=frozenset(options.by_hand),
         start_timeout_s=options.start_timeout_s,
     )
+
+
+def _pace(options: RunOptions) -> PaceConfig | None:
+    if not options.realtime:
+        return None
+    period_s = options.tick_s if options.period_s is None else options.period_s
+    return PaceConfig(period_s, options.hold_ticks)
 
 
 def _cores(nodes: int) -> list[int | None]:

@@ -85,7 +85,7 @@ class RunState:
     @property
     def all_linked(self) -> bool:
         """Whether the run can begin."""
-        own = self.plan.run.nodes - len(self.plan.by_hand)
+        own = len(self.plan.nodes) - len(self.plan.by_hand)
         return len(self.linked) == own and "plant" in self.ready
 
     @property
@@ -98,12 +98,13 @@ class RunState:
         """Senders from whom the recorder will hear nothing more (-1: the plant)."""
         if self.plant_stop is None:  # without the plant nothing reaches the recorder
             return [*range(self.plan.run.nodes), -1]
-        return [i for i, h in self.nodes.items() if not h.alive and i not in self.stopped]
+        quiet = {i for i, h in self.nodes.items() if not h.alive and i not in self.stopped}
+        return [j for c in self.plan.nodes if c.index in quiet for j in range(c.index, c.last + 1)]
 
     def who_is_missing(self) -> str:
         """Which processes and links are not there, for the start-up's time limit."""
         parts: list[str] = []
-        for i in range(self.plan.run.nodes):
+        for i in self.plan.run.firsts:
             name = f"node {i}"
             if i in self.linked or name in self.ready:
                 continue

@@ -14,7 +14,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 SHAPE_POINTS = 33
 """Points along the arm in /plant/shape, equally spaced in arclength, root and tip included."""
 METADATA = "octarm"
@@ -33,9 +33,13 @@ TIP = ("x_m", "y_m", "error_m", "reference_x_m", "reference_y_m")
 ENERGY = ("kinetic_j", "axial_j", "bending_j")
 REGULATED = ("mean_velocity_y_m_per_s", "mean_curvature_per_m")
 SHAPE = tuple(f"{axis}{i:02d}_m" for i in range(SHAPE_POINTS) for axis in "xy")
-SWEEP_TIMING = ("started_wall_ns", "duration_wall_ns", "advance_wall_ns")
-"""From the first measurement sent to the last command received by the plant; and the arm's own
-integration."""
+PACE = ("late",)
+"""1 if in real time the sweep before was not finished at this tick's begin, so that this tick has none and the
+commands are held; else 0."""
+SWEEP_TIMING = ("due_wall_ns", "started_wall_ns", "duration_wall_ns", "advance_wall_ns")
+"""When the tick should begin (in lock-step: when it did); its first measurement sent; from there to the last
+command received by the plant (0: not within this tick; a late tick has it of the sweep that ended in it); and
+the arm's own integration."""
 EVENT = ("level", "name", "message")
 
 _TEXT = {"level", "name", "message"}
@@ -128,6 +132,7 @@ def plant_channels(nodes: int) -> list[Channel]:
         Channel("/plant/energy", ENERGY),
         Channel("/plant/regulated", REGULATED),
         Channel("/plant/shape", SHAPE),
+        Channel("/plant/pace", PACE),
         Channel("/sweep/timing", SWEEP_TIMING),
     ]
 

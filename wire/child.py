@@ -107,6 +107,15 @@ class Child:
         came."""
         return [json.loads(line) for line in self.wait_lines(seconds)]
 
+    def wait_precisely(self, nanoseconds: int) -> list[dict[str, Any]]:
+        """The same as `wait` with a time that is not rounded up to milliseconds."""
+        *lines, self._buffer = self._buffer.split(b"\n")
+        if not lines:
+            watched = [self._read] if self.orphaned else [self._read, max(0, self._control)]
+            if select.select(watched, (), (), max(0, nanoseconds) * 1e-9)[0]:
+                lines = self.wait_lines(0.0)
+        return [json.loads(line) for line in lines]
+
     def wait_lines(self, seconds: float | None) -> list[bytes]:
         """The same with the control lines as they came."""
         timeout = None if seconds is None else max(0, int(seconds * 1000 + 0.999))

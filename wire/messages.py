@@ -7,13 +7,17 @@ process -> recorder (telemetry, counters), plant -> all (stop).
 A message is `[version, kind, run, tick, sender, setpoint, payload]`: five integers that say what it
 is and where it belongs, the index of the active setpoint (theory, section 5: one set of sweep
 matrices a setpoint; of a command: the setpoint of the tick in which it is applied), and the payload.
-The payload of the control kinds is a list of doubles; that of the others is stated at their encoder.
+The payload of the control kinds is their doubles as bytes, little-endian; that of the others is stated at
+their encoder. Control messages come every tick, so they are written with integers of fixed width: all that
+differs from tick to tick stands at a fixed place (`Outgoing`), and a receiver knows the first 32 bytes
+beforehand (`Incoming`).
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum, StrEnum
 from typing import Any, NamedTuple
@@ -22,7 +26,7 @@ import msgpack
 import numpy as np
 import numpy.typing as npt
 
-VERSION = 2
+VERSION = 3
 PLANT = -1
 """The sender number of the plant; nodes send their index 0..n-1."""
 FIELDS = 7
@@ -33,7 +37,20 @@ LARGEST_TICK = 2**53
 """Ticks beyond this could not be told apart in a recording, whose numbers are doubles."""
 
 _pack: Callable[[object], bytes] = msgpack.Packer(autoreset=True).pack
-_FLOATS = {float}
+_HEADER = struct.Struct(">BBBBQBQBiBHBH")
+"""A list of 7: version and kind in a byte each, run and tick as uint 64, sender as int 32, setpoint as uint 16,
+and the head of a byte string with its length as uint 16."""
+_MARKS = (0x97, 0xCF, 0xCF, 0xD2, 0xCD, 0xC5)
+_TICK_AT = 13
+_TICK = struct.Struct(">Q")
+_SETPOINT_AT = 27
+_SETPOINT = struct.Struct(">H")
+HEADER_BYTES = _HEADER.size
+"""Of a control message; its doubles follow, aligned."""
+MOST_NUMBERS = 0xFFFF // 8
+"""Doubles that a control message can carry."""
+F8 = np.dtype("<f8")
+Array = npt.NDArray[np.float64]
 
 
 class Kind(IntEnum):
@@ -106,16 +123,82 @@ def run_tag(run_id: str) -> int:
     return int.from_bytes(hashlib.sha256(run_id.encode()).digest()[:8], "big") >> 1
 
 
+def _header(kind: Kind, run: int, tick: int, sender: int, setpoint: int, numbers: int) -> bytes:
+    """The first 32 bytes of a control message."""
+    lst, u64, _, i32, u16, b16 = _MARKS
+    return _HEADER.pack(
+        lst, VERSION, kind, u64, run, u64, tick, i32, sender, u16, setpoint, b16, 8 * numbers
+    )
+
+
 def encode_numbers(
     kind: Kind, run: int, tick: int, sender: int, setpoint: int, values: Sequence[float]
 ) -> bytes:
     """Encode a measurement, command, forward or backward sum; `values` are Python floats."""
-    return _pack([VERSION, int(kind), run, tick, sender, setpoint, values])
+    header = _header(kind, run, tick, sender, setpoint, len(values))
+    return header + struct.pack(f"<{len(values)}d", *values)
+
+
+class Outgoing:
+    """One kind of message that a process sends every tick, in a buffer that is made once.
+
+    `values` (numbers,) is the payload itself: what is written there is what the next `stamped` sends.
+    ValueError for more numbers than a message can carry.
+    """
+
+    def __init__(self, kind: Kind, run: int, sender: int, numbers: int) -> None:
+        if numbers > MOST_NUMBERS:
+            raise ValueError(f"a message carries at most {MOST_NUMBERS} numbers, not {numbers}")
+        self._raw = bytearray(_header(kind, run, 0, sender, 0, numbers) + bytes(8 * numbers))
+        self.values: Array = np.frombuffer(self._raw, F8, offset=HEADER_BYTES)
+
+    def stamped(self, tick: int, setpoint: int) -> bytes:
+        """The whole message of this tick, with the values as they are now."""
+        raw = self._raw
+        _TICK.pack_into(raw, _TICK_AT, tick)
+        _SETPOINT.pack_into(raw, _SETPOINT_AT, setpoint)
+        return bytes(raw)
+
+
+class Incoming:
+    """One kind of message that a process receives every tick: what it must look like, known beforehand.
+
+    `lengths` gives for each setpoint how many doubles it carries. After `expect`, `values` is one
+    comparison for the message that is due, and a full decoding for any other.
+    """
+
+    def __init__(self, kind: Kind, run: int, sender: int, lengths: Sequence[int]) -> None:
+        self._kind, self._run, self._sender = kind, run, sender
+        self._lengths = tuple(lengths)
+        self._headers = [
+            _header(kind, run, 0, sender, setpoint, numbers)
+            for setpoint, numbers in enumerate(lengths)
+        ]
+        self.expect(0, 0)
+
+    def expect(self, tick: int, setpoint: int) -> None:
+        """The message that is due now is that of this tick and setpoint."""
+        header = self._headers[setpoint]
+        self._due = header[:_TICK_AT] + _TICK.pack(tick) + header[_TICK_AT + 8 :]
+        self._size = HEADER_BYTES + 8 * self._lengths[setpoint]
+
+    def due(self, raw: bytes) -> bool:
+        """Whether these bytes are the message that is due; its numbers may still not be finite."""
+        return len(raw) == self._size and raw.startswith(self._due)
+
+    def decode(self, raw: bytes) -> Numbers:
+        """Decode and check any message of this kind and sender; RejectedError as `decode_numbers`."""
+        return decode_numbers(raw, self._kind, self._run, self._sender, self._lengths)
+
+
+def numbers_of(raw: bytes) -> Array:
+    """The doubles of a message that is `due`, without copying them; read-only."""
+    return np.frombuffer(raw, F8, offset=HEADER_BYTES)
 
 
 def encode_batch(run: int, tick: int, sender: int, rows: npt.NDArray[np.float64]) -> bytes:
     """Encode telemetry rows of shape (rows, columns), little-endian doubles in row order."""
-    payload = [rows.shape[1], rows.astype("<f8", copy=False).tobytes()]
+    payload = [rows.shape[1], rows.astype(F8, copy=False).tobytes()]
     return _pack([VERSION, int(Kind.TELEMETRY), run, tick, sender, 0, payload])
 
 
@@ -140,29 +223,26 @@ def decode_numbers(
     `lengths` gives for each setpoint how many doubles such a message carries (a sum's rank may
     differ).
     """
-    tick, came_from, setpoint, values = _header(raw, kind, run)
+    tick, came_from, setpoint, payload = _fields(raw, kind, run)
     if came_from != sender:
         raise RejectedError(Reason.SENDER, f"expected sender {sender}, got {came_from}")
     if not 0 <= setpoint < len(lengths):
         raise RejectedError(Reason.SETPOINT, f"expected 0..{len(lengths) - 1}, got {setpoint}")
-    if type(values) is not list:
-        raise RejectedError(Reason.TYPE, f"expected a list of doubles, got {_name(values)}")
-    if len(values) != lengths[setpoint]:
-        raise RejectedError(
-            Reason.LENGTH, f"expected {lengths[setpoint]} doubles, got {len(values)}"
-        )
-    if values:
-        if set(map(type, values)) != _FLOATS:
-            raise RejectedError(Reason.TYPE, "expected doubles only")
-        # One sum decides the usual case; it may overflow where every term is finite.
-        if not math.isfinite(sum(values)) and not all(map(math.isfinite, values)):
-            raise RejectedError(Reason.NOT_FINITE, f"got {values}")
+    if type(payload) is not bytes:
+        raise RejectedError(Reason.TYPE, f"expected the bytes of doubles, got {_name(payload)}")
+    expected = lengths[setpoint]
+    if len(payload) != 8 * expected:
+        raise RejectedError(Reason.LENGTH, f"expected {expected} doubles, got {len(payload)} bytes")
+    values = list(struct.unpack(f"<{expected}d", payload))
+    # One sum decides the usual case; it may overflow where every term is finite.
+    if not math.isfinite(sum(values)) and not all(map(math.isfinite, values)):
+        raise RejectedError(Reason.NOT_FINITE, f"got {values}")
     return Numbers(tick, came_from, setpoint, values)
 
 
 def decode_batch(raw: bytes, run: int, columns: Mapping[int, int]) -> Batch:
     """Decode telemetry; `columns` gives for each known sender its number of columns."""
-    tick, sender, _, payload = _header(raw, Kind.TELEMETRY, run)
+    tick, sender, _, payload = _fields(raw, Kind.TELEMETRY, run)
     if sender not in columns:
         raise RejectedError(Reason.SENDER, f"unknown sender {sender}")
     if type(payload) is not list or len(payload) != 2 or type(payload[1]) is not bytes:
@@ -172,7 +252,7 @@ def decode_batch(raw: bytes, run: int, columns: Mapping[int, int]) -> Batch:
         raise RejectedError(Reason.LENGTH, f"expected {columns[sender]} columns, got {width!r}")
     if not data or len(data) % (8 * width):
         raise RejectedError(Reason.LENGTH, f"{len(data)} bytes are no whole number of rows")
-    rows = np.frombuffer(data, dtype="<f8").reshape(-1, width)
+    rows = np.frombuffer(data, dtype=F8).reshape(-1, width)
     if not np.isfinite(rows).all():
         raise RejectedError(Reason.NOT_FINITE, f"telemetry of sender {sender} from tick {tick}")
     return Batch(tick, sender, rows)
@@ -180,7 +260,7 @@ def decode_batch(raw: bytes, run: int, columns: Mapping[int, int]) -> Batch:
 
 def decode_counters(raw: bytes, run: int) -> tuple[int, int, dict[str, int]]:
     """Decode final counters; returns (sender, first tick not done, counters)."""
-    tick, sender, _, payload = _header(raw, Kind.COUNTERS, run)
+    tick, sender, _, payload = _fields(raw, Kind.COUNTERS, run)
     if type(payload) is not list:
         raise RejectedError(Reason.TYPE, f"expected a list of counters, got {_name(payload)}")
     out: dict[str, int] = {}
@@ -196,7 +276,7 @@ def decode_counters(raw: bytes, run: int) -> tuple[int, int, dict[str, int]]:
 
 def decode_stop(raw: bytes, run: int) -> Stop:
     """Decode the order to stop; only the plant may give it."""
-    tick, sender, _, payload = _header(raw, Kind.STOP, run)
+    tick, sender, _, payload = _fields(raw, Kind.STOP, run)
     if sender != PLANT:
         raise RejectedError(Reason.SENDER, f"expected the plant, got {sender}")
     if type(payload) is not list or [type(p) for p in payload] != [str, str]:
@@ -226,7 +306,7 @@ def _unpack(raw: bytes) -> list[Any]:
     return fields
 
 
-def _header(raw: bytes, kind: Kind, run: int) -> tuple[int, int, int, Any]:
+def _fields(raw: bytes, kind: Kind, run: int) -> tuple[int, int, int, Any]:
     """Check the fields that every kind has; returns tick, sender, setpoint, payload."""
     version, came_kind, came_run, tick, sender, setpoint, payload = _unpack(raw)
     if type(version) is not int or version != VERSION:

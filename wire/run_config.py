@@ -88,6 +88,24 @@ class SchedulingConfig:
 
 
 @dataclass(frozen=True)
+class PaceConfig:
+    """A run in real time: the monotonic clock says when a tick begins."""
+
+    period_s: float
+    """Between two ticks, wall clock."""
+    hold_ticks: int
+    """So many ticks in a row may be late, the last commands held; then the arm goes safe."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.period_s) and self.period_s > 0.0):
+            raise UsageError(
+                f"period_s: expected a positive number of seconds, got {self.period_s!r}"
+            )
+        if self.hold_ticks < 0:
+            raise UsageError(f"hold_ticks: expected 0 or more, got {self.hold_ticks}")
+
+
+@dataclass(frozen=True)
 class RunConfig:
     """One run: everything that its numbers depend on, apart from the gains artefact's content."""
 
@@ -121,6 +139,10 @@ class RunConfig:
     """u(0), one a node."""
     energy_weights: tuple[tuple[float, ...], ...]
     """(n, 4), J per unit squared: sum of w x^2 is the energy of a state deviation x."""
+    segments_per_process: int
+    """How many segments a node process has; the last one may have fewer."""
+    pace: PaceConfig | None
+    """None: lock-step, as fast as the machine goes."""
 
     def __post_init__(self) -> None:
         if self.nodes < 2:
@@ -136,6 +158,10 @@ class RunConfig:
         for name in (self.setpoint, *(n for leg in self.legs for n in (*leg.through, leg.to))):
             if name not in self.setpoint_names:
                 raise UsageError(f"setpoint {name!r}: not in {self.setpoint_names}")
+        if self.segments_per_process < 1:
+            raise UsageError(
+                f"segments_per_process: expected at least 1, got {self.segments_per_process}"
+            )
         count = len(self.setpoint_names)
         if any(not 0 <= index < count for index in self.scheduling.setpoints):
             raise UsageError(f"scheduling: setpoints {self.scheduling.setpoints} of {count}")
@@ -144,6 +170,11 @@ class RunConfig:
     def setpoint_index(self) -> int:
         """Position of the setpoint at the start among `setpoint_names`."""
         return self.setpoint_names.index(self.setpoint)
+
+    @property
+    def firsts(self) -> tuple[int, ...]:
+        """The first segment of each node process: what the process is called by."""
+        return tuple(range(0, self.nodes, self.segments_per_process))
 
 
 @dataclass(frozen=True)
@@ -160,6 +191,8 @@ class LinkConfig:
     """Zero of the recorded wall-clock instants, on the monotonic clock that all processes share."""
     cpu: int | None
     """The core to run on, None to leave it to the scheduler."""
+    fifo: int | None
+    """Priority of real-time scheduling (SCHED_FIFO), None for the ordinary one."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.deadline_s) and self.deadline_s > 0.0):
@@ -167,29 +200,52 @@ class LinkConfig:
 
 
 @dataclass(frozen=True)
+class SegmentConfig:
+    """One segment of a node: its matrices and its reference."""
+
+    factors: dict[str, Any]
+    """Sweep factors and initial values, see wire.factors."""
+    reference: dict[str, Any]
+    """State and command that the segment should have at each tick, see wire.reference."""
+
+
+@dataclass(frozen=True)
 class NodeConfig:
-    """What one node needs: its place in the chain, its matrices, its links."""
+    """What one node needs: its place in the chain, its segments, its links."""
 
     run_id: str
     index: int
+    """Of its first segment; what the node is called by."""
     nodes: int
-    ticks: int
+    """Segments of the whole arm."""
     setpoint: int
     """Index of the setpoint whose gains are in use at the start."""
     scheduling: SchedulingConfig
     batch_ticks: int
     """Telemetry is sent every so many ticks."""
+    skip_ticks: int
+    """How many ticks at most a message may be ahead: in real time a late sweep leaves ticks out."""
     links: LinkConfig
-    factors: dict[str, Any]
-    """The node's sweep factors and initial values, see wire.factors."""
-    reference: dict[str, Any]
-    """State and command that the node should have at each tick, see wire.reference."""
+    segments: tuple[SegmentConfig, ...]
+    """From the root to the tip; usually one."""
 
     def __post_init__(self) -> None:
-        if self.nodes < 2 or not 0 <= self.index < self.nodes:
-            raise UsageError(f"index: expected 0..{self.nodes - 1}, got {self.index}")
+        if not self.segments:
+            raise UsageError("segments: expected at least one, got none")
+        if self.nodes < 2 or not 0 <= self.index <= self.last < self.nodes:
+            raise UsageError(
+                f"index: expected {len(self.segments)} of the segments 0..{self.nodes - 1}, got "
+                f"{self.index}..{self.last}"
+            )
         if self.batch_ticks < 1:
             raise UsageError(f"batch_ticks: expected at least 1, got {self.batch_ticks}")
+        if self.skip_ticks < 0:
+            raise UsageError(f"skip_ticks: expected 0 or more, got {self.skip_ticks}")
+
+    @property
+    def last(self) -> int:
+        """Index of the last segment."""
+        return self.index + len(self.segments) - 1
 
 
 @dataclass(frozen=True)
@@ -201,6 +257,8 @@ class PlantConfig:
     setpoint: dict[str, Any]
     reference: dict[str, Any]
     """Where the tip, and the means over the arm, should be at each tick, see wire.reference."""
+    holding_n_per_m: tuple[tuple[float, ...], ...]
+    """For each setpoint the loads that hold it, one a segment: what a safe arm is left under."""
     batch_ticks: int
     links: LinkConfig
 

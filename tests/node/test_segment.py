@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
 from node.segment import NotFiniteError, Segment
+
 from node.sweep import NodeSweep
 from wire.factors import NodeFactors, SweepFactors
 from wire.messages import Numbers, Reason, RejectedError

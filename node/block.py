@@ -1,0 +1,319 @@
+"""The segments of one process in a tick: whatever arrives first, the sums go on as soon as they can, the
+commands last.
+
+Between the process around it (`node.process`: Zenoh in, Zenoh out) and the mathematics of each segment
+(`node.sweep`). During tick k segment i holds xh_i(k) and u_i(k), takes y_i(k), c and d in any order, and gives
+c_{i+1}, d_{i-1} and u_i(k+1) (theory, section 5). Usually a process has one segment; with several, the sums
+between them are handed on in memory, by the same mathematics in the same order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from time import monotonic_ns
+from typing import Protocol
+
+import numpy as np
+
+from node.row import RowBlock
+from node.sweep import Array, NodeSweep, Numbers
+from wire.channels import MEASUREMENT
+from wire.errors import UsageError
+from wire.factors import STATES
+from wire.messages import Reason, RejectedError
+
+Y = len(MEASUREMENT)
+_OUTPUT = ("velocity_x", "velocity_y", "strain", "curvature", "command")
+
+
+class NotFiniteError(Exception):
+    """A number that this node computed is not finite; the text names node, tick and field."""
+
+
+class Outlet(Protocol):
+    """Where a block's results go: arrays that it fills, and a word when they are complete."""
+
+    forward: Array
+    """The sum to the tip's side; empty at the tip."""
+    backward: Array
+    """The sum to the root's side; empty at the root."""
+    commands: Array
+    """u(k+1) of all segments."""
+
+    def send_forward(self, tick: int, setpoint: int) -> None:
+        """`forward` is complete."""
+
+    def send_backward(self, tick: int, setpoint: int) -> None:
+        """`backward` is complete."""
+
+    def send_commands(self, tick: int, setpoint: int) -> None:
+        """`commands` is complete; it belongs to the tick after this one and its setpoint."""
+
+    def recorded(self, tick: int, rows: Sequence[Array]) -> None:
+        """Rows (ticks, columns) of each segment from this tick on; left alone until the next batch but one."""
+
+    def begins(self, tick: int, setpoint: int) -> None:
+        """The tick whose messages are expected now, and its setpoint."""
+
+
+BATCH_NS = 250_000_000
+"""Rows do not wait longer than this for a batch to fill, while ticks go on."""
+
+
+class SegmentBlock:
+    """Consecutive segments within their tick. Not thread-safe: the process around it holds a lock.
+
+    A segment's row is y (2), xh (4), u, setpoint, bump, c, d, then the instants on the monotonic clock, in
+    ns after `epoch_ns`, at which the measurement, c (unless it is the root's), d (unless the tip's) came and
+    the command left. `batch` rows are handed over at once, the first time `first_batch`.
+    """
+
+    def __init__(
+        self,
+        sweeps: Sequence[NodeSweep],
+        outlet: Outlet,
+        *,
+        batch: int = 1,
+        first_batch: int | None = None,
+        epoch_ns: int = 0,
+    ) -> None:
+        _check_chain(sweeps)
+        self.tick = 0
+        self.began_ns = 0
+        """When the first message of this tick came; 0 between two ticks."""
+        self.ended_ns = 0
+        """When the last tick ended; 0 before the first has."""
+        self.passed = 0
+        """Sums that were handed on in memory."""
+        self._sweeps = tuple(sweeps)
+        self._root, self._tip = sweeps[0], sweeps[-1]
+        self._outlet = outlet
+        self._epoch_ns = epoch_ns
+        inner = [(np.zeros(s.forward_sent), np.zeros(s.backward_sent)) for s in sweeps]
+        for i, sweep in enumerate(sweeps):
+            sweep.send_from(
+                outlet.forward if i == len(sweeps) - 1 else inner[i][0],
+                outlet.backward if i == 0 else inner[i][1],
+            )
+        self._inner = tuple(pairwise(sweeps))
+        self._backward_inner = tuple((b, a) for a, b in reversed(self._inner))
+        self._setpoints = frozenset(map(float, range(sweeps[0].setpoints)))
+        self._blocks = tuple(tuple(_rows(sweep, batch) for sweep in sweeps) for _ in range(2))
+        self._batch, self._quota = batch, first_batch or batch
+        self._half = self._filled = 0
+        self._batch_began_ns = 0
+        for sweep, rows in zip(sweeps, self._blocks[0], strict=True):
+            sweep.start_in(rows.rows[0])
+        self._clear()
+        outlet.begins(0, self.setpoint)
+
+    def _clear(self) -> None:
+        self._have_y = False
+        self._have_c, self._have_d = self._root.first, self._tip.last
+        self._y_ns = self._c_ns = self._d_ns = self.began_ns = 0
+
+    @property
+    def setpoint(self) -> int:
+        """Index of the setpoint whose factors are in use in this tick."""
+        return self._root.setpoint
+
+    @property
+    def begun(self) -> bool:
+        """Whether something of this tick has come."""
+        return self.began_ns != 0
+
+    def missing(self) -> list[str]:
+        """What this tick still waits for, in words."""
+        out = []
+        if not self._have_y:
+            out.append("measurement from the plant")
+        if not self._have_c:
+            out.append(f"forward sum from node {self._root.index - 1}")
+        if not self._have_d:
+            out.append(f"backward sum from node {self._tip.index + 1}")
+        return out
+
+    # -- what comes -------------------------------------------------------------------------------
+
+    def on_measurement(self, values: Numbers, at_ns: int) -> None:
+        """Take y(k) of all segments; RejectedError if it is here already or not finite."""
+        if self._have_y:
+            raise self._twice()
+        self._y_ns = at_ns
+        if len(self._sweeps) == 1:
+            self._root.input(values)
+        else:
+            for i, sweep in enumerate(self._sweeps):
+                sweep.input(values[Y * i : Y * i + Y])
+        if not math.isfinite(sum(float(s.row.y[0] + s.row.y[1]) for s in self._sweeps)):
+            _refuse_not_finite("measurement", values)
+        self._have_y = True
+        self.began_ns = self.began_ns or at_ns
+        if self._have_c:
+            self._forward()
+        if self._have_d:
+            self._backward()
+        if self._have_c and self._have_d:
+            self._finish()
+
+    def on_forward(self, values: Numbers, at_ns: int) -> None:
+        """Take c of the first segment from its neighbour; RejectedError as above."""
+        if self._have_c:
+            raise self._twice()
+        total = self._root.take_forward(values)
+        if not math.isfinite(total):
+            self._explain("forward sum", values, self._root)
+        self._have_c, self._c_ns = True, at_ns
+        self.began_ns = self.began_ns or at_ns
+        if self._have_y:
+            self._forward()
+            if self._have_d:
+                self._finish()
+
+    def on_backward(self, values: Numbers, at_ns: int) -> None:
+        """Take d of the last segment from its neighbour; RejectedError as above, also for an announced setpoint
+        that does not exist."""
+        if self._have_d:
+            raise self._twice()
+        if values[-1] not in self._setpoints:
+            raise RejectedError(
+                Reason.SETPOINT,
+                f"expected one of {len(self._setpoints)} setpoints, got {float(values[-1])!r}",
+            )
+        total = self._tip.take_backward(values)
+        if not math.isfinite(total):
+            self._explain("backward sum", values, self._tip)
+        self._have_d, self._d_ns = True, at_ns
+        self.began_ns = self.began_ns or at_ns
+        if self._have_y:
+            self._backward()
+            if self._have_c:
+                self._finish()
+
+    def skip_to(self, tick: int) -> None:
+        """Nothing of this tick will come, the next is `tick`: the ticks between had no sweep."""
+        self._hand_over(self.tick)
+        for sweep, block in zip(self._sweeps, self._blocks[self._half], strict=True):
+            sweep.start_in(block.rows[0])
+            sweep.skip_to(tick)
+        self.tick = tick
+        self._clear()
+        self._outlet.begins(tick, self.setpoint)
+
+    # -- what goes --------------------------------------------------------------------------------
+
+    def _forward(self) -> None:
+        """The sums to the tip's side, through all segments and on."""
+        for sweep, following in self._inner:
+            following.take_forward(sweep.forward_sum())
+            self.passed += 1
+        last = self._tip
+        if not last.last:
+            numbers = last.forward_sum()
+            if not math.isfinite(np.add.reduce(numbers)):
+                self._check(numbers, "forward sum", last)
+            self._outlet.send_forward(self.tick, last.setpoint)
+
+    def _backward(self) -> None:
+        """The sums to the root's side, through all segments and on."""
+        for sweep, following in self._backward_inner:
+            following.take_backward(sweep.backward_sum())
+            self.passed += 1
+        first = self._root
+        if not first.first:
+            numbers = first.backward_sum()
+            if not math.isfinite(np.add.reduce(numbers)):
+                self._check(numbers, "backward sum", first)
+            self._outlet.send_backward(self.tick, first.setpoint)
+
+    def _finish(self) -> None:
+        """Commands of the next tick, records of this one, and the next tick begins."""
+        outlet, commands, sweeps = self._outlet, self._outlet.commands, self._sweeps
+        for i, sweep in enumerate(sweeps):
+            output = sweep.output()
+            if not math.isfinite(np.add.reduce(output)):
+                self._check(output, "estimate or command", sweep)
+            commands[i] = output[STATES]
+        outlet.send_commands(self.tick, self._root.next_setpoint)
+        sent_ns = monotonic_ns()
+        epoch = self._epoch_ns
+        instants = [self._y_ns - epoch, self._c_ns - epoch, self._d_ns - epoch, sent_ns - epoch]
+        for sweep in sweeps:
+            _note(sweep, instants)
+        self.tick += 1
+        self.ended_ns = sent_ns
+        self._clear()
+        if not self._filled:
+            self._batch_began_ns = sent_ns
+        self._filled += 1
+        if self._filled >= self._quota or sent_ns - self._batch_began_ns > BATCH_NS:
+            self._hand_over(self.tick)
+        block, at = self._blocks[self._half], self._filled
+        for i, sweep in enumerate(sweeps):
+            sweep.accept(sweep.last_output, block[i].rows[at])
+        outlet.begins(self.tick, self._root.setpoint)
+
+    def flush(self) -> None:
+        """Hand over the rows of all ticks that are done."""
+        if self._filled:
+            self.skip_to(self.tick)
+
+    def _hand_over(self, next_tick: int) -> None:
+        """Give the filled rows to the recorder, in batches, and go on in the other half."""
+        if self._filled:
+            rows = [block.array[: self._filled] for block in self._blocks[self._half]]
+            self._outlet.recorded(next_tick - self._filled, rows)
+            self._half, self._filled, self._quota = 1 - self._half, 0, self._batch
+
+    # -- what is wrong ----------------------------------------------------------------------------
+
+    def _twice(self) -> RejectedError:
+        return RejectedError(Reason.DUPLICATE, f"tick {self.tick} has it already")
+
+    def _explain(self, field: str, values: Numbers, sweep: NodeSweep) -> None:
+        """A total is not finite: refuse what came, or fail for what was made of it; or it only overflowed."""
+        _refuse_not_finite(field, values)
+        for product in sweep.products:
+            self._check(product, f"product of the {field}", sweep)
+
+    def _check(self, numbers: Array, field: str, sweep: NodeSweep) -> None:
+        wrong = np.flatnonzero(~np.isfinite(numbers))
+        if wrong.size:
+            at = int(wrong[0])
+            name = _OUTPUT[at] if field.startswith("estimate") else f"{field}[{at}]"
+            raise NotFiniteError(
+                f"tick {self.tick}: node {sweep.index} computed {name} = {float(numbers[at])}"
+            )
+
+
+def _check_chain(sweeps: Sequence[NodeSweep]) -> None:
+    if not sweeps:
+        raise UsageError("a node process needs at least one segment")
+    for a, b in pairwise(sweeps):
+        if b.index != a.index + 1 or a.forward_sent != b.forward_received:
+            raise UsageError(
+                f"segments {a.index} and {b.index} of one process are not neighbours of one "
+                "deployment; deploy the gains again"
+            )
+
+
+def _rows(sweep: NodeSweep, batch: int) -> RowBlock:
+    instants = 2 + (not sweep.first) + (not sweep.last)
+    return RowBlock(batch, sweep.forward_received, sweep.backward_received, instants)
+
+
+def _note(sweep: NodeSweep, instants: list[int]) -> None:
+    row = sweep.row.instants
+    row[0], row[-1] = instants[0], instants[3]
+    if not sweep.first:
+        row[1] = instants[1]
+    if not sweep.last:
+        row[-2] = instants[2]
+
+
+def _refuse_not_finite(field: str, values: Numbers) -> None:
+    for at, value in enumerate(values):
+        if not math.isfinite(value):
+            raise RejectedError(Reason.NOT_FINITE, f"{field}[{at}] is {float(value)}")
