@@ -76,6 +76,7 @@ class CentralRun:
     """(K,) index of the setpoint whose matrix is used in tick k."""
     bumps: Array
     """(K, n): the part of u(k) that hides a change of gains."""
+    # rows of late ticks, which have no sweep, are NaN; their setpoint is the one that stays in use
 
 
 def central_run(recording: Recording, ticks: int) -> CentralRun:
@@ -93,8 +94,15 @@ def central_run(recording: Recording, ticks: int) -> CentralRun:
     active = announced = run.setpoint_index
     changed, bump, now = False, np.zeros(run.nodes), references.states(0)
     for k in range(ticks):
-        out[k], bumps[k], setpoints[k] = state, bump, active
         then = references.states(k + 1)
+        setpoints[k] = active
+        if recording.late[k]:
+            # The estimate keeps its deviation from the reference, the command is held.
+            out[k], bumps[k] = np.nan, np.nan
+            state[:, :4] += then[:, :4] - now[:, :4]
+            now = then
+            continue
+        out[k], bumps[k] = state, bump
         inputs = np.concatenate([state, recording.measurements[k]], axis=1)
         following = steps[active].about(inputs, now, then)
         jump = (state[:, 4] - now[:, 4]) - (following[:, 4] - then[:, 4])
@@ -128,7 +136,7 @@ def compare_with_central(recording: Recording, tolerance: float = 1e-12) -> Cent
 
     Raises UsageError if the recording has no complete tick.
     """
-    usable = np.isfinite(recording.measurements).all(axis=(1, 2))
+    usable = np.isfinite(recording.measurements).all(axis=(1, 2)) | recording.late
     ticks = int(np.argmin(usable)) if not usable.all() else usable.size
     # The values of tick k depend on measurements up to k - 1 only.
     ticks = min(ticks + 1, recording.ticks)
@@ -143,6 +151,7 @@ def compare_with_central(recording: Recording, tolerance: float = 1e-12) -> Cent
     relative = np.abs(recorded - central) / scales
     missing = np.isnan(relative)  # what the recorder did not get cannot be compared
     relative[missing] = 0.0
+    missing[recording.late[:ticks]] = False  # and in late ticks there is nothing to get
     per_tick: Array = relative.max(axis=(1, 2))
 
     def at(tick: int) -> Difference:
@@ -172,8 +181,8 @@ def compare_with_central(recording: Recording, tolerance: float = 1e-12) -> Cent
 
 def _scales(central: Array, weights: Array) -> Array:
     """What to divide the differences of each quantity by, shape (5,); central: (K, n, 5)."""
-    largest = np.max(np.abs(central), axis=(0, 1))
-    energy = float(np.max(energy_norm(central[:, :, :4], weights)))
+    largest = np.nanmax(np.abs(central), axis=(0, 1))
+    energy = float(np.nanmax(energy_norm(central[:, :, :4], weights)))
     alone = energy / np.sqrt(np.max(weights, axis=0))
     largest[:4] = np.maximum(largest[:4], _SMALLEST_SHARE * alone)
     return np.where(largest > 0.0, largest, 1.0)

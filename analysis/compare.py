@@ -14,8 +14,8 @@ from analysis.table import Column, Table
 
 WALL = "_wall_ns"
 """End of the names of fields that differ from run to run."""
-_OWN = {"run_id", "artefact_path"}
-"""Parts of the configuration that name a run and say nothing about its numbers."""
+_OWN = {"run_id", "artefact_path", "segments_per_process", "pace"}
+"""Parts of the configuration that name a run, or say how it was done, and nothing about its numbers."""
 
 
 def first_difference(one: Recording, other: Recording) -> str | None:

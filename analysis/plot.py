@@ -318,6 +318,9 @@ def draw_sweeps(ax: Any, recording: Recording) -> None:
     """Histogram of the sweeps' durations with median and 99th percentile."""
     durations = recording.sweep_durations_ms
     durations = durations[np.isfinite(durations)]
+    if durations.size == 0:
+        ax.set_axis_off()
+        return
     p50, p99 = np.percentile(durations, [50.0, 99.0])
     end = 1.3 * float(p99)
     ax.hist(durations[durations <= end], bins=40, range=(0.0, end), color=BLUE, alpha=0.75)

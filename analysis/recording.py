@@ -28,6 +28,7 @@ from wire.channels import (
     FORMAT_VERSION,
     MEASUREMENT,
     METADATA,
+    PACE,
     SHAPE,
     SHAPE_POINTS,
     STATE,
@@ -104,9 +105,17 @@ class Recording:
         return self.of_nodes("estimate", STATE)
 
     @cached_property
+    def late(self) -> npt.NDArray[np.bool_]:
+        """(K,) ticks of a run in real time that had no sweep: nothing measured, nothing estimated."""
+        return self.of_plant("pace", PACE)[:, 0] > 0.0
+
+    @cached_property
     def commands(self) -> Array:
-        """u_i(k): transverse load in N/m, (K, n)."""
-        return self.of_nodes("command", COMMAND)[:, :, 0]
+        """u_i(k): transverse load in N/m, (K, n); in late ticks those that were held."""
+        commands = self.of_nodes("command", COMMAND)[:, :, 0]
+        for k in np.flatnonzero(self.late):
+            commands[k] = commands[k - 1]
+        return commands
 
     @cached_property
     def truth(self) -> Array:
@@ -135,9 +144,11 @@ class Recording:
 
     @cached_property
     def sweep_durations_ms(self) -> Array:
-        """From the first measurement sent to the last command received, wall clock, (K,)."""
+        """From the first measurement sent to the last command received, wall clock, (K,); NaN in a tick in
+        which no sweep ended."""
         table = self.table("/sweep/timing")
-        return table.by_tick(("duration_wall_ns",), self.ticks)[:, 0] * 1e-6
+        durations = table.by_tick(("duration_wall_ns",), self.ticks)[:, 0] * 1e-6
+        return np.where(durations > 0.0, durations, np.nan)
 
     @cached_property
     def initial_estimates(self) -> Array:
@@ -209,8 +220,8 @@ class Recording:
     def intact_links(self) -> int | None:
         """Directed links between neighbours whose two ends saw the same bytes in the same order.
 
-        2 (n - 1) if everything that was sent arrived unaltered; None unless every node has sent its
-        counters.
+        2 (n - 1) if everything that was sent arrived unaltered (with p processes 2 (p - 1)); None unless every
+        node has sent its counters.
         """
         counts = [self.process_counters(f"node/{self._label(i)}") for i in self._indices]
         if not all(counts):
@@ -218,8 +229,9 @@ class Recording:
         pairs = [("forward", a, b) for a, b in pairwise(counts)]
         pairs += [("backward", b, a) for a, b in pairwise(counts)]
         return sum(
-            all(a.get(f"{way}_sent_{what}") == b.get(f"{way}_received_{what}") for what in _FLOW)
+            all(a[f"{way}_sent_{what}"] == b.get(f"{way}_received_{what}") for what in _FLOW)
             for way, a, b in pairs
+            if f"{way}_sent_messages" in a  # else both are in one process
         )
 
     def ending(self) -> str | None:

@@ -79,8 +79,7 @@ def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
         (
             "neighbour messages",
             _traffic(s),
-            f"counted by receivers; 2 (n - 1) = {s['neighbour_messages_expected_per_tick']} "
-            f"expected; links intact: {_count(s['intact_links'])}",
+            _expected(s),
         ),
         ("message size", _number(s["bytes_per_message"], "B", 4), "mean, on the wire"),
         (
@@ -88,6 +87,7 @@ def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
             f"p50 {_number(sweep['p50'], 'ms')}, p99 {_number(sweep['p99'], 'ms')}",
             "wall clock, first measurement sent to last command back",
         ),
+        *_pace(s),
         (
             "difference to central",
             _number(s["max_difference_to_central"], "", 2),
@@ -241,6 +241,27 @@ def _traffic(s: dict[str, Any]) -> str:
     if s["neighbour_messages"] is None:
         return "unknown"
     return f"{s['neighbour_messages']}, {_count(s['neighbour_messages_per_tick'])} a tick"
+
+
+def _expected(s: dict[str, Any]) -> str:
+    """What there should be between neighbours, and whether the links are sound."""
+    letter = "n" if s["node_processes"] == s["nodes"] else "p"
+    text = f"counted by receivers; 2 ({letter} - 1) = {s['neighbour_messages_expected_per_tick']} expected"
+    if letter == "p":
+        text += f" of p = {s['node_processes']} processes"
+        text += f"; in memory: {_count(s['passed_messages_per_tick'])} a tick"
+    return f"{text}; links intact: {_count(s['intact_links'])}"
+
+
+def _pace(s: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """How well a run in real time kept its pace."""
+    pace = s["realtime"]
+    if pace is None:
+        return []
+    held = f"longest hold {pace['longest_hold_ticks']}, {pace['hold_ticks']} may be"
+    period = _number(1e3 * pace["period_s"], "ms", 4)
+    value = f"period {period}, {pace['late_ticks']} late"
+    return [("real time", value, f"ticks whose sweep before was not over, commands held; {held}")]
 
 
 def _stops(s: dict[str, Any]) -> str:

@@ -80,6 +80,7 @@ def summary_of(recording: Recording) -> dict[str, Any]:
         "seed": run.seed,
         **_traffic(recording),
         "sweep_ms": _percentiles(durations),
+        "realtime": _realtime(recording),
         "start_up_s": _start_up(recording),
         "max_difference_to_central": central.worst.relative,
         "difference_to_central": _central(central),
@@ -142,12 +143,17 @@ def _traffic(recording: Recording) -> dict[str, Any]:
     size = recording.counter("neighbour_bytes")
     reporting = recording.counter("nodes_reporting")
     done = recording.counter("ticks_recorded") if reporting == nodes else None
+    if done is not None:
+        done -= recording.counter("late_ticks") or 0
     return {
+        "node_processes": len(recording.configuration.firsts),
         "nodes_reporting": reporting,
         "neighbour_messages": neighbours,
         "neighbour_messages_sent": recording.counter("neighbour_messages_sent"),
         "neighbour_messages_per_tick": _ratio(neighbours, done),
-        "neighbour_messages_expected_per_tick": 2 * (nodes - 1),
+        "neighbour_messages_expected_per_tick": 2 * (len(recording.configuration.firsts) - 1),
+        "passed_messages": recording.counter("passed_messages"),
+        "passed_messages_per_tick": _ratio(recording.counter("passed_messages"), done),
         "bytes_per_message": _ratio(size, neighbours),
         "sweep_messages": {
             "forward": recording.total("forward_received_messages"),
@@ -190,10 +196,25 @@ def _ratio(count: int | None, by: int | None) -> float | int | None:
 
 
 def _percentiles(durations: Any) -> dict[str, float | None]:
+    names, shares = ("p50", "p95", "p99", "p99.9", "max"), (50.0, 95.0, 99.0, 99.9, 100.0)
     if durations.size == 0:
-        return {"p50": None, "p99": None}
-    p50, p99 = np.percentile(durations, [50.0, 99.0])
-    return {"p50": float(p50), "p99": float(p99)}
+        return dict.fromkeys(names)
+    return dict(zip(names, np.percentile(durations, shares).tolist(), strict=True))
+
+
+def _realtime(recording: Recording) -> dict[str, Any] | None:
+    """How well a run in real time kept its pace; None in lock-step."""
+    pace = recording.configuration.pace
+    if pace is None:
+        return None
+    late = np.concatenate([[False], recording.late, [False]])
+    edges = np.flatnonzero(np.diff(late.astype(np.int8)))
+    return {
+        "period_s": pace.period_s,
+        "hold_ticks": pace.hold_ticks,
+        "late_ticks": int(np.count_nonzero(recording.late)),
+        "longest_hold_ticks": int(np.max(edges[1::2] - edges[::2], initial=0)),
+    }
 
 
 def _start_up(recording: Recording) -> float:

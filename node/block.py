@@ -9,9 +9,9 @@ between them are handed on in memory, by the same mathematics in the same order.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from itertools import pairwise
+from math import isfinite
 from time import monotonic_ns
 from typing import Protocol
 
@@ -21,10 +21,11 @@ from node.row import RowBlock
 from node.sweep import Array, NodeSweep, Numbers
 from wire.channels import MEASUREMENT
 from wire.errors import UsageError
-from wire.factors import STATES
+from wire.factors import OUTPUTS, STATES
 from wire.messages import Reason, RejectedError
 
 Y = len(MEASUREMENT)
+_total_output = np.ones(OUTPUTS).dot
 _OUTPUT = ("velocity_x", "velocity_y", "strain", "curvature", "command")
 
 
@@ -102,6 +103,8 @@ class SegmentBlock:
         self._setpoints = frozenset(map(float, range(sweeps[0].setpoints)))
         self._blocks = tuple(tuple(_rows(sweep, batch) for sweep in sweeps) for _ in range(2))
         self._batch, self._quota = batch, first_batch or batch
+        self._total_forward = np.ones(outlet.forward.size).dot
+        self._total_backward = np.ones(outlet.backward.size).dot
         self._half = self._filled = 0
         self._batch_began_ns = 0
         for sweep, rows in zip(sweeps, self._blocks[0], strict=True):
@@ -147,8 +150,9 @@ class SegmentBlock:
         else:
             for i, sweep in enumerate(self._sweeps):
                 sweep.input(values[Y * i : Y * i + Y])
-        if not math.isfinite(sum(float(s.row.y[0] + s.row.y[1]) for s in self._sweeps)):
-            _refuse_not_finite("measurement", values)
+        for sweep in self._sweeps:
+            if not isfinite(sweep.row.y[0] + sweep.row.y[1]):
+                _refuse_not_finite("measurement", values)
         self._have_y = True
         self.began_ns = self.began_ns or at_ns
         if self._have_c:
@@ -162,9 +166,8 @@ class SegmentBlock:
         """Take c of the first segment from its neighbour; RejectedError as above."""
         if self._have_c:
             raise self._twice()
-        total = self._root.take_forward(values)
-        if not math.isfinite(total):
-            self._explain("forward sum", values, self._root)
+        if not isfinite(self._root.take_forward(values)):
+            _refuse_not_finite("forward sum", values)
         self._have_c, self._c_ns = True, at_ns
         self.began_ns = self.began_ns or at_ns
         if self._have_y:
@@ -182,9 +185,8 @@ class SegmentBlock:
                 Reason.SETPOINT,
                 f"expected one of {len(self._setpoints)} setpoints, got {float(values[-1])!r}",
             )
-        total = self._tip.take_backward(values)
-        if not math.isfinite(total):
-            self._explain("backward sum", values, self._tip)
+        if not isfinite(self._tip.take_backward(values)):
+            _refuse_not_finite("backward sum", values)
         self._have_d, self._d_ns = True, at_ns
         self.began_ns = self.began_ns or at_ns
         if self._have_y:
@@ -212,7 +214,7 @@ class SegmentBlock:
         last = self._tip
         if not last.last:
             numbers = last.forward_sum()
-            if not math.isfinite(np.add.reduce(numbers)):
+            if not isfinite(self._total_forward(numbers)):
                 self._check(numbers, "forward sum", last)
             self._outlet.send_forward(self.tick, last.setpoint)
 
@@ -224,7 +226,7 @@ class SegmentBlock:
         first = self._root
         if not first.first:
             numbers = first.backward_sum()
-            if not math.isfinite(np.add.reduce(numbers)):
+            if not isfinite(self._total_backward(numbers)):
                 self._check(numbers, "backward sum", first)
             self._outlet.send_backward(self.tick, first.setpoint)
 
@@ -233,7 +235,7 @@ class SegmentBlock:
         outlet, commands, sweeps = self._outlet, self._outlet.commands, self._sweeps
         for i, sweep in enumerate(sweeps):
             output = sweep.output()
-            if not math.isfinite(np.add.reduce(output)):
+            if not isfinite(_total_output(output)):
                 self._check(output, "estimate or command", sweep)
             commands[i] = output[STATES]
         outlet.send_commands(self.tick, self._root.next_setpoint)
@@ -272,12 +274,6 @@ class SegmentBlock:
     def _twice(self) -> RejectedError:
         return RejectedError(Reason.DUPLICATE, f"tick {self.tick} has it already")
 
-    def _explain(self, field: str, values: Numbers, sweep: NodeSweep) -> None:
-        """A total is not finite: refuse what came, or fail for what was made of it; or it only overflowed."""
-        _refuse_not_finite(field, values)
-        for product in sweep.products:
-            self._check(product, f"product of the {field}", sweep)
-
     def _check(self, numbers: Array, field: str, sweep: NodeSweep) -> None:
         wrong = np.flatnonzero(~np.isfinite(numbers))
         if wrong.size:
@@ -315,5 +311,5 @@ def _note(sweep: NodeSweep, instants: list[int]) -> None:
 
 def _refuse_not_finite(field: str, values: Numbers) -> None:
     for at, value in enumerate(values):
-        if not math.isfinite(value):
+        if not isfinite(value):
             raise RejectedError(Reason.NOT_FINITE, f"{field}[{at}] is {float(value)}")

@@ -249,6 +249,9 @@ class NodeProcess:
         return out
 
     def _send_batches(self) -> None:
+        """What could wait: records to the recorder, and the sums over what was sent and received."""
+        for flow in (*self._received.values(), *self._sent.values()):
+            flow.settle()
         while self._batches:
             tick, segments = self._batches.popleft()
             for index, rows in enumerate(segments, self._config.index):

@@ -23,15 +23,16 @@ OWN = _X + len(SCHEDULE)
 
 class TickRow:
     """Views into one row: y (2,), state (5,) estimate and command, x (7,) both; schedule (2,); c and d as they
-    came, c_sum and d_sum without what the scheduling added; instants: the rest."""
+    came, c_sum and d_sum without what the scheduling added, c_extra what it added; instants: the rest."""
 
-    __slots__ = ("c", "c_sum", "d", "d_sum", "instants", "schedule", "state", "x", "y")
+    __slots__ = ("c", "c_extra", "c_sum", "d", "d_sum", "instants", "schedule", "state", "x", "y")
 
     def __init__(self, row: Array, forward: int, backward: int) -> None:
         self.y, self.state, self.x = row[:_Y], row[_Y:_X], row[:_X]
         self.schedule = row[_X:OWN]
         end = OWN + forward
         self.c, self.c_sum = row[OWN:end], row[OWN : max(OWN, end - FORWARD_EXTRA)]
+        self.c_extra = row[max(OWN, end - FORWARD_EXTRA) : end]
         self.d = row[end : end + backward]
         self.d_sum = row[end : max(end, end + backward - BACKWARD_EXTRA)]
         self.instants = row[end + backward :]

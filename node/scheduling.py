@@ -10,10 +10,26 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from wire.run_config import SchedulingConfig
+
+
+def grow(
+    end: Sequence[float], turn_rad: float, stretch: float, chord_x_m: float, chord_y_m: float
+) -> tuple[float, float, float]:
+    """The end (turn, x, y) of an arm with one segment more: the reference's chord, turned by turn_rad more and
+    stretched."""
+    turn, x, y = end
+    turn += turn_rad
+    cosine, sine = stretch * math.cos(turn), stretch * math.sin(turn)
+    return (
+        turn,
+        x + cosine * chord_x_m - sine * chord_y_m,
+        y + sine * chord_x_m + cosine * chord_y_m,
+    )
 
 
 class ArmEnd(NamedTuple):
@@ -24,14 +40,8 @@ class ArmEnd(NamedTuple):
     y_m: float
 
     def grown(self, turn_rad: float, stretch: float, chord_x_m: float, chord_y_m: float) -> ArmEnd:
-        """With one segment more: the reference's chord, turned by turn_rad more and stretched."""
-        turn = self.turn_rad + turn_rad
-        cosine, sine = stretch * math.cos(turn), stretch * math.sin(turn)
-        return ArmEnd(
-            turn,
-            self.x_m + cosine * chord_x_m - sine * chord_y_m,
-            self.y_m + sine * chord_x_m + cosine * chord_y_m,
-        )
+        """With one segment more, see `grow`."""
+        return ArmEnd(*grow(self, turn_rad, stretch, chord_x_m, chord_y_m))
 
 
 CLAMP = ArmEnd(0.0, 0.0, 0.0)

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from node.row import TickRow
-from node.scheduling import CLAMP, ArmEnd, Sectors
+from node.scheduling import CLAMP, ArmEnd, Sectors, grow
 from wire.errors import OctarmError, UsageError
 from wire.factors import (
     BACKWARD_EXTRA,
@@ -37,6 +37,7 @@ from wire.reference import TERMS, Leg, Reference
 
 Array = npt.NDArray[np.float64]
 Numbers = Array | Sequence[float]
+add, subtract = np.add, np.subtract
 
 CHORD = 2
 """Numbers of a reference behind state and command: x and y from the inner to the outer face, m."""
@@ -57,6 +58,9 @@ class _Products:
         self.of_c = np.ascontiguousarray(np.vstack([factors.W, factors.P]))
         self.of_d = np.ascontiguousarray(np.vstack([factors.V, factors.U]))
         c, d = factors.forward_sent, factors.backward_sent
+        # bound once: these are the products of every tick
+        self.multiply_input = self.of_input.dot
+        self.multiply_c, self.multiply_d = self.of_c.dot, self.of_d.dot
         self.from_input = np.zeros(c + d + OUTPUTS)
         self.from_c, self.from_d = np.zeros(c + OUTPUTS), np.zeros(d + OUTPUTS)
         self.c_of_input, self.c_of_c = self.from_input[:c], self.from_c[:c]
@@ -116,7 +120,8 @@ class NodeSweep:
         self._fade = fade
         self._next_bump = 0.0
         self._reference = reference or resting_at(factors.setpoints[setpoint])
-        self._now, self._then = self._reference.at(0), self._reference.at(1)
+        self._now = self._reference.at(0)
+        self._expect(self._reference.at(1))
         if self._now.shape != (OUTPUTS + CHORD,):
             raise UsageError(
                 f"node {self.index}: expected a reference of {OUTPUTS + CHORD} numbers, got "
@@ -127,6 +132,9 @@ class NodeSweep:
         self._aimed = self._now
         self._aim()
         self._output = np.zeros(OUTPUTS)
+        # a product with ones is the quickest sum of a short array
+        self._total_c = np.ones(self.forward_received).dot
+        self._total_d = np.ones(self.backward_received).dot
         sums = factors.setpoints[0]
         self.forward_sent = 0 if self.last else sums.forward_sent + FORWARD_EXTRA
         """How many numbers the sum to the tip's side has."""
@@ -154,12 +162,6 @@ class NodeSweep:
     def last_output(self) -> Array:
         """What `output` gave last, (5,)."""
         return self._output
-
-    @property
-    def products(self) -> tuple[Array, Array, Array]:
-        """What input, c and d were last multiplied to."""
-        p = self._active
-        return p.from_input, p.from_c, p.from_d
 
     @property
     def setpoint(self) -> int:
@@ -205,28 +207,29 @@ class NodeSweep:
         it: measurement, estimate, command (7,)."""
         row, p = self.row, self._active
         row.y[:] = measurement
-        np.subtract(row.x, self._offset, out=self._deviation)
-        np.dot(p.of_input, self._deviation, out=p.from_input)
+        subtract(row.x, self._offset, self._deviation)
+        p.multiply_input(self._deviation, p.from_input)
         return row.x
 
     def take_forward(self, c: Numbers) -> float:
-        """Take the sum from the root's side and multiply it; finite only if all of it and the products are."""
+        """Take the sum from the root's side and multiply it; returns its total, finite only if all of it is."""
         row, p = self.row, self._active
         if len(c) != self.forward_received:
             raise self._wrong_length("forward", len(c), self.forward_received)
         row.c[:] = c
-        np.dot(p.of_c, row.c_sum, out=p.from_c)
-        extra: list[float] = row.c[-FORWARD_EXTRA:].tolist()
-        return float(np.add.reduce(p.from_c)) + sum(extra)
+        p.multiply_c(row.c_sum, p.from_c)
+        total: float = self._total_c(row.c)
+        return total
 
     def take_backward(self, d: Numbers) -> float:
-        """Take the sum from the tip's side and multiply it; finite only if all of it and the products are."""
+        """Take the sum from the tip's side and multiply it; returns its total, finite only if all of it is."""
         row, p = self.row, self._active
         if len(d) != self.backward_received:
             raise self._wrong_length("backward", len(d), self.backward_received)
         row.d[:] = d
-        np.dot(p.of_d, row.d_sum, out=p.from_d)
-        return float(np.add.reduce(p.from_d)) + float(row.d[-1])
+        p.multiply_d(row.d_sum, p.from_d)
+        total: float = self._total_d(row.d)
+        return total
 
     def forward_sum(self) -> Array:
         """W c + Q (in - in_ref) and the arm with this segment, after `input` and `take_forward`."""
@@ -234,9 +237,9 @@ class NodeSweep:
         if self.first:
             self._c_sum[:] = p.c_of_input
         else:
-            np.add(p.c_of_c, p.c_of_input, out=self._c_sum)
-        end, out = self._grown(), self._c_next
-        out[-3], out[-2], out[-1] = end
+            add(p.c_of_c, p.c_of_input, self._c_sum)
+        out = self._c_next
+        out[-3], out[-2], out[-1] = self._grown()
         return out
 
     def backward_sum(self) -> Array:
@@ -246,7 +249,7 @@ class NodeSweep:
             self._d_sum[:] = p.d_of_input
             self._d_previous[-1] = self._decided
         else:
-            np.add(p.d_of_d, p.d_of_input, out=self._d_sum)
+            add(p.d_of_d, p.d_of_input, self._d_sum)
             self._d_previous[-1] = self.row.d[-1]
         return self._d_previous
 
@@ -270,11 +273,11 @@ class NodeSweep:
         """
         p, out = self._active, self._output
         if self.first:
-            np.add(p.out_of_input, p.out_of_d, out=out)
+            add(p.out_of_input, p.out_of_d, out)
         else:
-            np.add(p.out_of_input, p.out_of_c, out=out)
+            add(p.out_of_input, p.out_of_c, out)
             if not self.last:
-                np.add(out, p.out_of_d, out=out)
+                add(out, p.out_of_d, out)
         if self._changed:
             self._next_bump = float(self._deviation[_COMMAND] - out[STATES])
         else:
@@ -282,10 +285,10 @@ class NodeSweep:
         if self._next_bump:
             out[STATES] += self._next_bump
         if self.last:
-            self._announced, self._tip = self._decided, self._grown()
+            self._announced, self._tip = self._decided, ArmEnd(*self._grown())
         else:
             self._announced = int(self.row.d[-1])
-        return np.add(out, self._then[:OUTPUTS], out=out)
+        return add(out, self._then_output, out)
 
     def accept(self, output: Numbers, row: TickRow | None = None) -> None:
         """Make an output (5,) the state: estimate and command of the tick that begins, in another row."""
@@ -295,7 +298,10 @@ class NodeSweep:
         self.row = row
         self.tick += 1
         self.bump = self._next_bump
-        self._now, self._then = self._then, self._reference.at(self.tick + 1)
+        self._now = self._then
+        then = self._reference.at(self.tick + 1)
+        if then is not self._then:
+            self._expect(then)
         if self._aimed is not self._now:
             self._aim()
         self._changed = self._announced != self._setpoint
@@ -310,7 +316,8 @@ class NodeSweep:
         is the one that is held."""
         before = self._now
         self.tick = tick
-        self._now, self._then = self._reference.at(tick), self._reference.at(tick + 1)
+        self._now = self._reference.at(tick)
+        self._expect(self._reference.at(tick + 1))
         if self._now is not before:
             self.estimate[:] += self._now[:STATES] - before[:STATES]
         if self._aimed is not self._now:
@@ -321,6 +328,10 @@ class NodeSweep:
     def _label_row(self) -> None:
         self.row.schedule[0], self.row.schedule[1] = self._setpoint, self.bump
 
+    def _expect(self, then: Array) -> None:
+        """The reference of the next tick."""
+        self._then, self._then_output = then, then[:OUTPUTS]
+
     def _aim(self) -> None:
         """The reference of this tick as an offset of the input: its measurement is part of its state."""
         self._offset[:2] = self._now[MEASURED]
@@ -328,14 +339,14 @@ class NodeSweep:
         self._aimed = self._now
         _, _, self._strain, self._curvature, _, self._chord_x, self._chord_y = self._now.tolist()
 
-    def _grown(self) -> ArmEnd:
-        """The estimated arm up to this segment's outer face."""
+    def _grown(self) -> tuple[float, float, float]:
+        """Where the estimated arm ends at this segment's outer face, as `ArmEnd`."""
         row = self.row
-        so_far = CLAMP if self.first else ArmEnd(*row.c[-FORWARD_EXTRA:].tolist())
+        so_far = CLAMP if self.first else row.c_extra.tolist()
         _, _, strain, curvature, _ = row.state.tolist()
         turn = (curvature - self._curvature) * self._bend
         stretch = (1.0 + strain) / (1.0 + self._strain)
-        return so_far.grown(turn, stretch, self._chord_x, self._chord_y)
+        return grow(so_far, turn, stretch, self._chord_x, self._chord_y)
 
     def _wrong_length(self, direction: str, count: int, expected: int) -> OctarmError:
         return OctarmError(

@@ -231,7 +231,8 @@ class PlantProcess:
             duration_ns = exchange.complete_ns - started_ns if done else 0
             self._add(k, state, (pace.due_ns(k), began_ns, duration_ns, advance_ns))
             state = following
-        return self._all_done()
+        # The last sweep may be late as well; it is let through, so that what was sent is also received.
+        return self._wait(exchange.tick) or self._all_done()
 
     def _safe(self, pace: Pace, k: int, state: Array) -> Stop:
         """Stop the nodes and let the arm rest under the loads that hold the setpoint, for some ticks."""

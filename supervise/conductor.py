@@ -116,8 +116,9 @@ class Conductor:
         self._collect_reports()
         code, message, tick = self._state.verdict(interrupted=self._interrupts > 0)
         self._finish_recording(code, message, tick)
-        if code is ExitCode.OK and (trouble := self._state.recording_trouble()):
-            code, message = ExitCode.DEGRADED, trouble
+        troubles = (self._state.recording_trouble(), self._state.pace_trouble())
+        if code is ExitCode.OK and any(troubles):
+            code, message = ExitCode.DEGRADED, "; ".join(filter(None, troubles))
         return Outcome(code, message, tick, run_s)
 
     def _spawn(self) -> None:

@@ -171,3 +171,13 @@ class RunState:
         if lost or self.closed["ticks_recorded"] < self.plan.run.ticks:
             return f"{where}: records were lost ({lost} node ticks)"
         return ""
+
+    def pace_trouble(self) -> str:
+        """What to say of a run that kept going, but not on time; empty if it did."""
+        late = int((self.closed or {}).get("late_ticks", 0))
+        if not late:
+            return ""
+        return (
+            f"{late} of {self.plan.run.ticks} ticks were late, their commands held; for fewer give a longer "
+            "--period or --sched fifo"
+        )

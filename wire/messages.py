@@ -170,17 +170,19 @@ class Incoming:
     def __init__(self, kind: Kind, run: int, sender: int, lengths: Sequence[int]) -> None:
         self._kind, self._run, self._sender = kind, run, sender
         self._lengths = tuple(lengths)
-        self._headers = [
+        headers = [
             _header(kind, run, 0, sender, setpoint, numbers)
             for setpoint, numbers in enumerate(lengths)
         ]
+        self._before_tick = headers[0][:_TICK_AT]
+        self._after_tick = [header[_TICK_AT + _TICK.size :] for header in headers]
+        self._sizes = [HEADER_BYTES + 8 * numbers for numbers in lengths]
         self.expect(0, 0)
 
     def expect(self, tick: int, setpoint: int) -> None:
         """The message that is due now is that of this tick and setpoint."""
-        header = self._headers[setpoint]
-        self._due = header[:_TICK_AT] + _TICK.pack(tick) + header[_TICK_AT + 8 :]
-        self._size = HEADER_BYTES + 8 * self._lengths[setpoint]
+        self._due = self._before_tick + _TICK.pack(tick) + self._after_tick[setpoint]
+        self._size = self._sizes[setpoint]
 
     def due(self, raw: bytes) -> bool:
         """Whether these bytes are the message that is due; its numbers may still not be finite."""
@@ -193,7 +195,7 @@ class Incoming:
 
 def numbers_of(raw: bytes) -> Array:
     """The doubles of a message that is `due`, without copying them; read-only."""
-    return np.frombuffer(raw, F8, offset=HEADER_BYTES)
+    return np.frombuffer(raw, F8, -1, HEADER_BYTES)
 
 
 def encode_batch(run: int, tick: int, sender: int, rows: npt.NDArray[np.float64]) -> bytes:

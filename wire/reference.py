@@ -92,9 +92,16 @@ class Reference:
         self._orders = [np.arange(leg.coefficients.shape[2], dtype=np.float64) for leg in legs]
         self._last = [self._moving(i, 1.0) for i in range(len(legs))]
         self._first = self._moving(0, 0.0) if legs[0].move_s > 0.0 else self._last[0]
+        # Outside of these ticks nothing moves, which is most of the time and needs no search.
+        self._moves_from = begins[0] / tick_s - 1.0
+        self._rests_from = ends[-1] / tick_s + 1.0
 
     def at(self, tick: int) -> Array:
         """The quantities (q,) at the start of a tick, the one that is held in its middle."""
+        if tick < self._moves_from:
+            return self._first
+        if tick > self._rests_from:
+            return self._last[-1]
         now = self._when(tick * self.tick_s)
         if self.held is None:
             return now
