@@ -108,7 +108,7 @@ class Conductor:
         self._wait_linked(Deadline(self._plan.start_timeout_s))
         nodes = _how_many(self._plan)
         self._view.note(f"{nodes}, plant and recorder linked in {monotonic() - began:.2f} s")
-        self._event(0, "info", "started", f"{nodes} linked")
+        self._event(0, "info", "started", f"{self._plan.run.nodes} nodes linked")
         self._order(self._plant, do="start")
         first = monotonic()
         self._watch()

@@ -79,8 +79,19 @@ class Cli:
     def wait_for_records(self) -> None:
         """Wait for the first tick, then until the recorder has written twice: whole ticks are on the disk."""
         self.wait_for("tick ")
+        self._wait_for_writes(2)
+
+    def wait_for_ticks(self) -> None:
+        """The same of a run that prints nothing."""
         limit = time.monotonic() + PATIENCE_S
-        for _ in range(2):
+        while not list(self.work.glob("**/recording.mcap")):
+            assert time.monotonic() < limit, "no recording"
+            time.sleep(0.02)
+        self._wait_for_writes(2)
+
+    def _wait_for_writes(self, times: int) -> None:
+        limit = time.monotonic() + PATIENCE_S
+        for _ in range(times):
             size = self.recording().stat().st_size
             while self.recording().stat().st_size == size:
                 assert time.monotonic() < limit, "the recorder writes nothing"

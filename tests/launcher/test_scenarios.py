@@ -276,11 +276,13 @@ def test_nodes_that_go_on_with_different_setpoints_stop_the_arm(
     finally:
         endpoints.close()
     plant = PlantProcess(plan.plant, Child("plant", control=-1, status=-1, directory=None))
-    assert plant._agreed(4) is None
-    plant._said = [1, 1, 1]
-    assert plant._agreed(5) is None
-    plant._said = [1, 0, 1]
-    stop = plant._agreed(6)
+    exchange = plant._exchange
+    assert plant._take(4) is None
+    exchange._said = [1, 1, 1]
+    assert plant._take(5) is None
+    assert exchange.setpoint == 1
+    exchange._said = [1, 0, 1]
+    stop = plant._take(6)
     assert stop is not None
     assert (stop.tick, stop.cause) == (6, "safety")
     assert stop.text == "tick 6: node 1: the next setpoint is straight, but 1 for node 0"
