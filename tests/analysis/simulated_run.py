@@ -34,6 +34,7 @@ from wire.run_config import (
     DisturbanceConfig,
     LegConfig,
     NoiseConfig,
+    PaceConfig,
     RunConfig,
     SchedulingConfig,
     dumps,
@@ -67,6 +68,8 @@ class Scenario:
     first_hold_s: float = 0.0
     legs: tuple[LegConfig, ...] = ()
     bump_s: float = 2.0
+    late: frozenset[int] = frozenset()
+    """Ticks that have no sweep; with any, the run is one in real time."""
 
 
 def scheduling(artefact: GainsArtefact, scenario: Scenario) -> SchedulingConfig:
@@ -117,6 +120,8 @@ def run_config(
             float(node.initial_command[index]) for node in deployment.nodes
         ),
         energy_weights=tuple(tuple(row) for row in deployment.energy_weights.tolist()),
+        segments_per_process=1,
+        pace=PaceConfig(scenario.tick_s, 3) if scenario.late else None,
     )
 
 
@@ -185,9 +190,16 @@ def write_recording(
         for i, node in enumerate(deployment.nodes)
     ]
     wall = np.random.default_rng(run.seed)
+    command = np.array([sweep.command for sweep in sweeps])
     for k in range(run.ticks):
-        measured = plant.measure() + noise.sample(k, n)
-        rows = node_rows(sweeps, measured, wall)
+        late = k in scenario.late
+        rows: dict[int, list[float]] = {}
+        if not late:
+            if k - 1 in scenario.late:
+                for sweep in sweeps:
+                    sweep.skip_to(k)
+            command = np.array([sweep.command for sweep in sweeps])
+            rows = node_rows(sweeps, plant.measure() + noise.sample(k, n), wall)
         tip, truth = plant.tip(), plant.truth()
         mean = np.diff(run.faces_m) @ (truth - references.states(k)[:, :4])
         wanted = references.plant.at(k)[:2]
@@ -200,18 +212,19 @@ def write_recording(
             float(mean[1]),
             float(mean[3]),
             *plant.shape_at(np.linspace(0.0, artefact.arm.length_m, SHAPE_POINTS)).ravel().tolist(),
+            float(late),
             3.1e8 + 1e6 * k,
-            float(np.round(1e6 * wall.lognormal(-0.8, 0.3))),
+            3.1e8 + 1e6 * k,
+            0.0 if k + 1 in scenario.late else float(np.round(1e6 * wall.lognormal(-0.8, 0.3))),
             1e5,
         ]
-        command = np.array([rows[i][6] for i in range(n)])
         writer.tick(k, {s: row for s, row in rows.items() if (k, s) not in skip})
         plant.advance(command, k)
     writer.event(run.ticks, "info", "finished", "every tick was done")
     writer.flush()
     if not close:
         shutil.copy(growing, path)
-    writer.close(summary(run))
+    writer.close(summary(run, len(scenario.late)))
     if close:
         growing.replace(path)
     return run
@@ -222,40 +235,36 @@ def node_rows(
 ) -> dict[int, list[float]]:
     """One tick of all nodes; their telemetry rows, and their states advanced."""
     n = len(sweeps)
-    inputs = [sweep.input(y).copy() for sweep, y in zip(sweeps, measured, strict=True)]
-    forward = [np.zeros(sweeps[0].forward_received)]
-    for i in range(n - 1):
-        forward.append(sweeps[i].forward(inputs[i], forward[i]).copy())
-    backward = [np.zeros(0)]
-    for i in range(n - 1, 0, -1):
-        backward.insert(0, sweeps[i].backward(inputs[i], backward[0]).copy())
+    for sweep, y in zip(sweeps, measured, strict=True):
+        sweep.input(y)
+    c = np.zeros(0)
+    for sweep in sweeps:
+        c = sweep.forward(c)
+    d = np.zeros(0)
+    for sweep in reversed(sweeps):
+        d = sweep.backward(d)
     rows: dict[int, list[float]] = {}
     for i, sweep in enumerate(sweeps):
         instants = 2 + (i > 0) + (i < n - 1)
-        rows[i] = [
-            *measured[i].tolist(),
-            *sweep.estimate.tolist(),
-            sweep.command,
-            float(sweep.setpoint),
-            sweep.bump,
-            *forward[i].tolist(),
-            *backward[i].tolist(),
-            *wall.integers(0, 10**6, instants).astype(float).tolist(),
-        ]
-        sweep.accept(sweep.output(inputs[i], forward[i], backward[i]))
+        row = sweep.row
+        parts = (row.x, row.schedule, row.c, row.d, wall.integers(0, 10**6, instants))
+        rows[i] = np.concatenate(parts).tolist()
+        sweep.accept(sweep.output())
     return rows
 
 
-def summary(run: RunConfig) -> dict[str, str]:
+def summary(run: RunConfig, late: int) -> dict[str, str]:
     """Final counters as the recorder writes them."""
-    n, ticks = run.nodes, run.ticks
+    n, ticks = run.nodes, run.ticks - late
     messages = 2 * (n - 1) * ticks
     totals = {
-        "ticks_recorded": ticks,
+        "ticks_recorded": run.ticks,
         "ticks_lost": 0,
+        "late_ticks": late,
         "nodes_reporting": n,
         "neighbour_messages": messages,
         "neighbour_bytes": messages * BYTES_PER_MESSAGE,
+        "passed_messages": 0,
         "neighbour_messages_sent": messages,
         "measurement_messages": n * ticks,
         "measurement_bytes": n * ticks * 40,

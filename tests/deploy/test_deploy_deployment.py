@@ -23,17 +23,17 @@ TICK = 0.02
 
 def run_chain(sweeps: Sequence[NodeSweep], measurements: Array) -> Array:
     """One tick of all nodes, messages handed over as lists; returns the outputs (n, 5)."""
-    n = len(sweeps)
-    inputs = [sweep.input(measurements[i]) for i, sweep in enumerate(sweeps)]
-    c: list[list[float]] = [[]]
-    for i in range(n):
-        c.append(sweeps[i].forward(inputs[i], c[i]).tolist())
-    d: list[list[float]] = [[]]
-    for i in range(n - 1, -1, -1):
-        d.append(sweeps[i].backward(inputs[i], d[-1]).tolist())
-    assert c[n] == []
-    assert d[n] == []
-    return np.stack([sweeps[i].output(inputs[i], c[i], d[n - 1 - i]) for i in range(n)])
+    for sweep, y in zip(sweeps, measurements, strict=True):
+        sweep.input(y)
+    c: list[float] = []
+    for sweep in sweeps:
+        c = sweep.forward(c).tolist()
+    d: list[float] = []
+    for sweep in reversed(sweeps):
+        d = sweep.backward(d).tolist()
+    assert c == []
+    assert d == []
+    return np.stack([sweep.output() for sweep in sweeps])
 
 
 def scales(deployment: Deployment) -> Array:

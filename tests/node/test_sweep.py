@@ -1,10 +1,15 @@
 """One node's sweep mathematics against plain matrix products."""
 
+from itertools import permutations
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from node.row import RowBlock
 from node.scheduling import Sectors
-from node.sweep import NodeSweep, Numbers
+from node.sweep import Array, NodeSweep, Numbers
 from wire.errors import OctarmError, UsageError
 from wire.factors import INPUTS, OUTPUTS, NodeFactors, SweepFactors
 from wire.reference import Leg, Reference
@@ -45,6 +50,24 @@ def random_node(seed: int, sizes: list[tuple[int, int, int, int]]) -> NodeFactor
     )
 
 
+def factor_input(sweep: NodeSweep, y: Numbers) -> Array:
+    """The input in the order of the factors: estimate, command, measurement."""
+    return np.concatenate([sweep.estimate, [sweep.command], y])
+
+
+def reference_input(wanted: Array) -> Array:
+    """The input of a node that is where the reference has it."""
+    return np.concatenate([wanted[:5], wanted[[1, 3]]])
+
+
+def tick_output(sweep: NodeSweep, y: Numbers, c: Numbers, d: Numbers) -> Array:
+    """One tick, all of it at once; the output (a copy)."""
+    sweep.input(y)
+    sweep.forward(c)
+    sweep.backward(d)
+    return sweep.output().copy()
+
+
 @pytest.mark.parametrize("sizes", [(3, 4, 2, 5), (0, 3, 3, 0), (2, 0, 0, 4)])
 @pytest.mark.parametrize("as_list", [False, True])
 def test_products_are_those_of_the_matrices(
@@ -58,29 +81,58 @@ def test_products_are_those_of_the_matrices(
         y = random.standard_normal(2)
         c = random.standard_normal(sizes[0])
         d = random.standard_normal(sizes[2])
-        expected_in = np.concatenate([sweep.estimate, [sweep.command], y])
-        z = expected_in - f.in_offset
+        state = [*sweep.estimate, sweep.command]
+        z = factor_input(sweep, y) - f.in_offset
         x = sweep.input(y.tolist() if as_list else y)
-        np.testing.assert_array_equal(x, expected_in)
+        np.testing.assert_array_equal(x, [*y, *state])
         c_sent: Numbers = np.append(c, SO_FAR) if sizes[0] else c
         d_sent: Numbers = np.append(d, 0.0) if sizes[2] else d
         if as_list:
             c_sent, d_sent = list(c_sent), list(d_sent)
         sums = f.V @ d + f.R @ z
         np.testing.assert_allclose(
-            sweep.backward(x, d_sent)[: len(sums)], sums, rtol=1e-13, atol=1e-13
+            sweep.backward(d_sent)[: len(sums)], sums, rtol=1e-13, atol=1e-13
         )
         sums = f.W @ c + f.Q @ z
-        np.testing.assert_allclose(
-            sweep.forward(x, c_sent)[: len(sums)], sums, rtol=1e-13, atol=1e-13
-        )
-        out = sweep.output(x, c_sent, d_sent)
+        np.testing.assert_allclose(sweep.forward(c_sent)[: len(sums)], sums, rtol=1e-13, atol=1e-13)
+        out = sweep.output().copy()
         np.testing.assert_allclose(
             out, f.D @ z + f.P @ c + f.U @ d + f.out_offset, rtol=1e-13, atol=1e-13
         )
+        np.testing.assert_array_equal(sweep.last_output, out)
         sweep.accept(out)
         np.testing.assert_array_equal(sweep.estimate, out[:4])
         assert sweep.command == out[4]
+
+
+@pytest.mark.parametrize("sizes", [(3, 4, 2, 5), (0, 3, 3, 0), (2, 0, 0, 4)])
+def test_the_order_of_the_three_changes_no_bit(sizes: tuple[int, int, int, int]) -> None:
+    results = set()
+    for order in permutations(("y", "c", "d")):
+        node = random_node(20, [sizes])
+        sweep = NodeSweep(node)
+        random = np.random.default_rng(21)
+        got = b""
+        for _ in range(4):
+            y = random.standard_normal(2)
+            c = np.append(random.standard_normal(sizes[0]), SO_FAR if sizes[0] else [])
+            d = np.append(random.standard_normal(sizes[2]), 0.0 if sizes[2] else [])
+            for what in order:
+                if what == "y":
+                    sweep.input(y)
+                elif what == "c" and not sweep.first:
+                    sweep.take_forward(c)
+                elif what == "d" and not sweep.last:
+                    sweep.take_backward(d)
+            if not sweep.last:
+                got += sweep.forward_sum().tobytes()
+            if not sweep.first:
+                got += sweep.backward_sum().tobytes()
+            out = 0.1 * sweep.output()
+            got += out.tobytes()
+            sweep.accept(out)
+        results.add(got)
+    assert len(results) == 1
 
 
 def test_products_use_their_own_arguments_only() -> None:
@@ -88,15 +140,71 @@ def test_products_use_their_own_arguments_only() -> None:
     node = random_node(12, [(2, 2, 3, 3)])
     f = node.setpoints[0]
     sweep = NodeSweep(node)
-    x = sweep.input([0.3, -0.2]).copy()
-    sweep.forward(2.0 * x, [5.0, 6.0, *SO_FAR])
-    sweep.backward(3.0 * x, [7.0, 8.0, 9.0, 0.0])
+    sweep.input([70.0, -30.0])
+    sweep.forward([5.0, 6.0, *SO_FAR])
+    sweep.backward([7.0, 8.0, 9.0, 0.0])
+    sweep.output()
     c, d = np.array([0.1, 0.2]), np.array([0.3, 0.4, 0.5])
-    z = x - f.in_offset
+    z = factor_input(sweep, [0.3, -0.2]) - f.in_offset
     expected = f.D @ z + f.P @ c + f.U @ d + f.out_offset
-    out = sweep.output(x, np.append(c, SO_FAR), np.append(d, 0.0))
+    out = tick_output(sweep, [0.3, -0.2], np.append(c, SO_FAR), np.append(d, 0.0))
     np.testing.assert_allclose(out, expected, rtol=1e-13, atol=1e-13)
     np.testing.assert_array_equal(sweep.estimate, node.initial_estimate[0])
+
+
+def test_the_total_of_a_sum_tells_whether_all_of_it_is_finite() -> None:
+    for at in range(5):
+        for bad in (np.nan, np.inf, -np.inf):
+            sweep = NodeSweep(random_node(22, [(2, 3, 4, 5)]))
+            c, d = np.ones(5), np.ones(5)
+            assert np.isfinite(sweep.take_forward(c))
+            assert np.isfinite(sweep.take_backward(d))
+            c[at] = d[at] = bad
+            with np.errstate(all="ignore"):
+                assert not np.isfinite(sweep.take_forward(c))
+                assert not np.isfinite(sweep.take_backward(d))
+
+
+def test_what_a_tick_knows_is_in_its_row() -> None:
+    sweep = NodeSweep(random_node(23, [(2, 3, 4, 5)]))
+    row = sweep.row
+    state = row.state.copy()
+    out = tick_output(sweep, [0.3, -0.2], [1.0, 2.0, *SO_FAR], [3.0, 4.0, 5.0, 6.0, 0.0])
+    sweep.accept(out)
+    np.testing.assert_array_equal(row.x, [0.3, -0.2, *state])
+    np.testing.assert_array_equal(row.schedule, [0.0, 0.0])
+    np.testing.assert_array_equal(row.c, [1.0, 2.0, *SO_FAR])
+    np.testing.assert_array_equal(row.d, [3.0, 4.0, 5.0, 6.0, 0.0])
+    assert sweep.row is not row
+    np.testing.assert_array_equal(sweep.row.state, out)
+
+
+def test_a_tick_goes_on_in_any_row_with_the_same_numbers() -> None:
+    results = []
+    for elsewhere in (False, True):
+        sweep = NodeSweep(random_node(24, [(2, 3, 4, 5)]))
+        rows = RowBlock(3, sweep.forward_received, sweep.backward_received, 4).rows
+        if elsewhere:
+            sweep.start_in(rows[0])
+        got = []
+        for tick in range(3):
+            c, d = [0.1 * tick, 0.2, *SO_FAR], [0.3, 0.4, 0.5, 0.6, 0.0]
+            got.append(tick_output(sweep, [0.1, 0.2], c, d))
+            sweep.accept(got[-1], rows[tick + 1] if elsewhere and tick < 2 else None)
+        results.append(np.stack(got))
+    np.testing.assert_array_equal(results[0], results[1])
+
+
+def test_sums_are_written_where_they_are_sent_from() -> None:
+    sweep = NodeSweep(random_node(25, [(2, 3, 4, 5)]))
+    assert (sweep.forward_sent, sweep.backward_sent) == (3 + 3, 5 + 1)
+    forward, backward = np.zeros(6), np.zeros(6)
+    sweep.send_from(forward, backward)
+    sweep.input([0.3, -0.2])
+    assert sweep.forward([1.0, 2.0, *SO_FAR]) is forward
+    assert sweep.backward([3.0, 4.0, 5.0, 6.0, 0.0]) is backward
+    assert forward.all()
+    assert backward[:-1].all()
 
 
 def test_starts_at_the_setpoint_it_is_told() -> None:
@@ -114,24 +222,23 @@ def test_selecting_a_setpoint_changes_the_factors_and_keeps_the_state() -> None:
     sweep.select(1)
     assert sweep.setpoint == 1
     np.testing.assert_array_equal(sweep.estimate, before)
-    x = sweep.input([0.1, 0.2])
+    sweep.input([0.1, 0.2])
     f = node.setpoints[1]
-    first = node.setpoints[0].out_offset  # the reference stays where the run rests
-    reference = np.concatenate([first, first[[1, 3]]])
-    expected = f.W @ [1.0, 2.0] + f.Q @ (x - reference)
-    np.testing.assert_allclose(sweep.forward(x, [1.0, 2.0, *SO_FAR])[:3], expected, rtol=1e-13)
+    reference = reference_input(node.setpoints[0].out_offset)  # it stays where the run rests
+    expected = f.W @ [1.0, 2.0] + f.Q @ (factor_input(sweep, [0.1, 0.2]) - reference)
+    np.testing.assert_allclose(sweep.forward([1.0, 2.0, *SO_FAR])[:3], expected, rtol=1e-13)
 
 
 @pytest.mark.parametrize("count", [0, 2, 6])
 def test_a_sum_of_the_wrong_length_is_refused(count: int) -> None:
     sweep = NodeSweep(random_node(9, [(2, 2, 2, 2)]))
-    x = sweep.input([0.0, 0.0])
+    sweep.input([0.0, 0.0])
     with pytest.raises(OctarmError, match=rf"node 3: forward sum of {count} numbers, expected 5"):
-        sweep.forward(x, [0.0] * count)
+        sweep.forward([0.0] * count)
     with pytest.raises(OctarmError, match=rf"node 3: backward sum of {count} numbers, expected 3"):
-        sweep.backward(x, [0.0] * count)
+        sweep.backward([0.0] * count)
     with pytest.raises(OctarmError, match="forward sum"):
-        sweep.output(x, [0.0] * count, [0.0] * 3)
+        sweep.take_forward([0.0] * count)
 
 
 @pytest.mark.parametrize("setpoint", [-1, 2])
@@ -142,11 +249,18 @@ def test_a_setpoint_that_does_not_exist_is_refused(setpoint: int) -> None:
 
 def test_nothing_is_allocated_between_ticks() -> None:
     sweep = NodeSweep(random_node(11, [(2, 3, 4, 5)]))
-    x = sweep.input([1.0, 2.0])
-    c_next, d_previous = sweep.forward(x, [1.0, 2.0, *SO_FAR]), sweep.backward(x, [1.0] * 5)
-    assert sweep.input([0.0, 0.0]) is x
-    assert sweep.forward(x, [0.0] * 5) is c_next
-    assert sweep.backward(x, [0.0] * 5) is d_previous
+    c_next = sweep.forward([1.0, 2.0, *SO_FAR])
+    d_previous = sweep.backward([1.0, 1.0, 1.0, 1.0, 0.0])
+    out, rows = sweep.output(), {id(sweep.row)}
+    for _ in range(4):
+        x = sweep.input([0.0, 0.0])
+        assert x is sweep.row.x
+        assert sweep.forward([0.0] * 5) is c_next
+        assert sweep.backward([0.0] * 5) is d_previous
+        assert sweep.output() is out
+        sweep.accept(out)
+        rows.add(id(sweep.row))
+    assert len(rows) == 2
 
 
 def test_a_change_of_gains_is_announced_then_taken_and_leaves_no_jump() -> None:
@@ -158,14 +272,16 @@ def test_a_change_of_gains_is_announced_then_taken_and_leaves_no_jump() -> None:
     random = np.random.default_rng(14)
     commands, raw, bumps, used = [], [], [], []
     for tick, announced in enumerate([0, 1, 1, 1, 1]):
-        x = sweep.input(random.standard_normal(2))
+        y = random.standard_normal(2)
         c, d = [*random.standard_normal(2), *SO_FAR], [*random.standard_normal(4), float(announced)]
         used.append(sweep.setpoint)
         f = node.setpoints[sweep.setpoint]
-        z = x - np.concatenate([node.setpoints[0].out_offset, node.setpoints[0].out_offset[[1, 3]]])
+        z = factor_input(sweep, y) - reference_input(node.setpoints[0].out_offset)
         raw.append(float((f.D @ z + f.P @ c[:2] + f.U @ d[:4])[4]) + reference)
-        assert sweep.backward(x, d)[-1] == announced
-        sweep.accept(sweep.output(x, c, d))
+        sweep.input(y)
+        sweep.forward(c)
+        assert sweep.backward(d)[-1] == announced
+        sweep.accept(sweep.output())
         assert sweep.next_setpoint == announced
         commands.append(sweep.command)
         bumps.append(sweep.bump)
@@ -186,9 +302,10 @@ def test_the_tip_decides_by_its_estimate_and_says_so_a_tick_later() -> None:
     announced = []
     for so_far in (before, beyond, beyond, beyond):
         sweep.estimate[2:] = 0.0
-        x = sweep.input([0.0, 0.0])
-        announced.append(sweep.backward(x, [])[-1])
-        sweep.accept(sweep.output(x, [0.1, 0.2, *so_far], []))
+        sweep.input([0.0, 0.0])
+        sweep.forward([0.1, 0.2, *so_far])
+        announced.append(sweep.backward([])[-1])
+        sweep.accept(sweep.output())
     assert announced == [0.0, 0.0, 1.0, 1.0]
     assert sweep.setpoint == 1
 
@@ -200,18 +317,44 @@ def test_the_reference_of_this_tick_goes_in_and_that_of_the_next_comes_out() -> 
     sweep = NodeSweep(node, reference=reference)
     f = node.setpoints[0]
     for tick in range(6):
-        x = sweep.input([0.4, -0.6]).copy()
+        x, estimate = factor_input(sweep, [0.4, -0.6]), sweep.estimate.copy()
         now, then = reference.at(tick)[:5], reference.at(tick + 1)[:5]
-        z = x - np.concatenate([now, now[[1, 3]]])
+        z = x - reference_input(now)
         expected = f.D @ z + f.P @ [0.1, 0.2] + f.U @ [1.0, 2.0, 3.0, 4.0] + then
-        out = sweep.output(x, [0.1, 0.2, *SO_FAR], [1.0, 2.0, 3.0, 4.0, 0.0])
+        c, d = [0.1, 0.2, *SO_FAR], [1.0, 2.0, 3.0, 4.0, 0.0]
+        out = tick_output(sweep, [0.4, -0.6], c, d)
         np.testing.assert_allclose(out, expected, rtol=1e-12, atol=1e-12)
-        turn = SO_FAR[0] + BEND * (x[3] - now[3])
-        chord = complex(*reference.at(tick)[5:]) * (1.0 + x[2]) / (1.0 + now[2])
+        turn = SO_FAR[0] + BEND * (estimate[3] - now[3])
+        chord = complex(*reference.at(tick)[5:]) * (1.0 + estimate[2]) / (1.0 + now[2])
         end = complex(*SO_FAR[1:]) + chord * np.exp(1j * turn)
-        sent = sweep.forward(x, [0.1, 0.2, *SO_FAR])[-3:]
+        sent = sweep.forward([0.1, 0.2, *SO_FAR])[-3:]
         np.testing.assert_allclose(sent, [turn, end.real, end.imag], rtol=1e-12, atol=1e-12)
         sweep.accept(out * 0.1)
+
+
+@given(before=st.integers(0, 5), ahead=st.integers(1, 8))
+def test_over_ticks_without_a_sweep_the_deviation_is_kept_and_the_command_held(
+    before: int, ahead: int
+) -> None:
+    node = random_node(19, [(2, 3, 4, 5)])
+    coefficients = np.random.default_rng(17).standard_normal((4, 7, 3))
+    reference = Reference(0.1, [Leg(0.1, 0.6, coefficients)])
+    sweep = NodeSweep(node, reference=reference)
+    c, d = [0.1, 0.2, *SO_FAR], [1.0, 2.0, 3.0, 4.0, 0.0]
+    for _ in range(before):
+        sweep.accept(0.1 * tick_output(sweep, [0.4, -0.6], c, d))
+    deviation, command = sweep.estimate - reference.at(before)[:4], sweep.command
+    then = before + ahead
+    sweep.skip_to(then)
+    assert sweep.tick == then
+    np.testing.assert_allclose(sweep.estimate - reference.at(then)[:4], deviation, atol=1e-12)
+    assert sweep.command == command
+    f = node.setpoints[0]
+    z = factor_input(sweep, [0.4, -0.6]) - reference_input(reference.at(then))
+    expected = f.D @ z + f.P @ c[:2] + f.U @ d[:4] + reference.at(then + 1)[:5]
+    np.testing.assert_allclose(
+        tick_output(sweep, [0.4, -0.6], c, d), expected, rtol=1e-12, atol=1e-12
+    )
 
 
 def test_a_reference_of_another_shape_is_refused() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,6 +74,63 @@ def test_a_wake_up_from_another_thread_ends_the_wait(pipes: Pipes) -> None:
     assert pipes.child.wait(deadline.left) == []
     assert not deadline.passed
     thread.join()
+
+
+def test_a_precise_wait_ends_for_the_same_reasons(pipes: Pipes) -> None:
+    ever_ns = 20 * 10**9
+    os.write(pipes.control, b'{"do":"start"}\n{"do":')
+    assert pipes.child.wait_precisely(ever_ns) == [{"do": "start"}]
+    assert pipes.child.wait_precisely(0) == []
+    assert pipes.child.wait_precisely(-5) == []
+    os.write(pipes.control, b'"stop"}\n')
+    assert pipes.child.wait_precisely(ever_ns) == [{"do": "stop"}]
+    pipes.child.wake()
+    assert pipes.child.wait_precisely(ever_ns) == []
+    assert not pipes.child.stopping
+
+
+def test_a_precise_wait_takes_its_time(pipes: Pipes) -> None:
+    began_ns = time.monotonic_ns()
+    assert pipes.child.wait_precisely(3_200_000) == []
+    assert time.monotonic_ns() - began_ns >= 3_200_000
+
+
+def test_a_precise_wait_gives_lines_that_were_read_before(pipes: Pipes) -> None:
+    os.write(pipes.control, b'{"a":1}\n{"do":"start"}\n{"do":"stop"}\n')
+    assert json.loads(pipes.child.configuration()) == {"a": 1}
+    assert pipes.child.wait_precisely(20 * 10**9) == [{"do": "start"}, {"do": "stop"}]
+
+
+def test_the_end_of_the_lifeline_ends_a_precise_wait_once(pipes: Pipes) -> None:
+    """After it, waiting takes its time again: the process still has things to end."""
+    os.close(pipes.control)
+    assert pipes.child.wait_precisely(20 * 10**9) == []
+    assert pipes.child.orphaned
+    assert pipes.child.stopping
+    began_ns = time.monotonic_ns()
+    assert pipes.child.wait_precisely(2_000_000) == []
+    assert time.monotonic_ns() - began_ns >= 2_000_000
+    assert 0 < signal.alarm(0) <= ORPHAN_S
+
+
+def test_a_child_without_a_lifeline_waits_precisely_for_wake_ups_only() -> None:
+    """A standard input that has something to read is not its lifeline."""
+    read, write = os.pipe()
+    os.write(write, b"not for the child")
+    standard_input = os.dup(0)
+    os.dup2(read, 0)
+    child = Child("node 1", control=-1, status=-1, directory=None)
+    try:
+        began_ns = time.monotonic_ns()
+        assert child.wait_precisely(2_000_000) == []
+        assert time.monotonic_ns() - began_ns >= 2_000_000
+        child.wake()
+        assert child.wait_precisely(20 * 10**9) == []
+    finally:
+        os.dup2(standard_input, 0)
+        for fd in (read, write, standard_input):
+            os.close(fd)
+        child.close()
 
 
 def test_status_lines_fit_into_one_write(pipes: Pipes) -> None:

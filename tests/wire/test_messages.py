@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from typing import Any
 
 import msgpack
@@ -12,8 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wire.messages import (
+    HEADER_BYTES,
+    MOST_NUMBERS,
     PLANT,
+    Incoming,
     Kind,
+    Outgoing,
     Reason,
     RejectedError,
     Stop,
@@ -26,6 +31,7 @@ from wire.messages import (
     encode_numbers,
     encode_stop,
     kind_of,
+    numbers_of,
     run_tag,
 )
 
@@ -43,16 +49,30 @@ anything = st.recursive(
 )
 
 
+control = st.sampled_from([Kind.MEASUREMENT, Kind.COMMAND, Kind.FORWARD_SUM, Kind.BACKWARD_SUM])
+ticks = st.integers(0, 2**53)
+senders = st.integers(-1, 10_000)
+
+
+def doubles(*values: float) -> bytes:
+    """A payload: little-endian doubles."""
+    return struct.pack(f"<{len(values)}d", *values)
+
+
+def bits(values: Any) -> list[bytes]:
+    return [struct.pack("<d", value) for value in values]
+
+
 def message(**changes: Any) -> bytes:
-    """A good forward sum from node 2 with fields replaced."""
+    """A good forward sum from node 2 with fields replaced, as msgpack itself writes it."""
     fields: dict[str, Any] = {
-        "version": 2,
+        "version": 3,
         "kind": int(Kind.FORWARD_SUM),
         "run": RUN,
         "tick": 7,
         "sender": 2,
         "setpoint": 0,
-        "payload": [1.0, 2.0, 3.0],
+        "payload": doubles(1.0, 2.0, 3.0),
     }
     return bytes(msgpack.packb(list((fields | changes).values())))
 
@@ -65,8 +85,8 @@ def refusal(raw: bytes) -> Reason:
 
 @given(
     values=st.lists(finite, max_size=12),
-    tick=st.integers(0, 2**53),
-    sender=st.integers(-1, 10_000),
+    tick=ticks,
+    sender=senders,
     setpoint=st.integers(0, 2),
 )
 def test_numbers_come_back_bit_by_bit(
@@ -85,12 +105,14 @@ def test_numbers_come_back_bit_by_bit(
 )
 def test_every_non_finite_number_is_refused(values: list[float], at: int, bad: float) -> None:
     values[at] = bad
-    assert refusal(message(payload=values)) is Reason.NOT_FINITE
+    assert refusal(message(payload=doubles(*values))) is Reason.NOT_FINITE
+    good = encode_numbers(Kind.FORWARD_SUM, RUN, 7, 2, 0, values)
+    assert refusal(good) is Reason.NOT_FINITE
 
 
 def test_large_finite_numbers_are_not_mistaken_for_infinite_ones() -> None:
     values = [1.7e308, 1.7e308, 1.7e308]
-    got = decode_numbers(message(payload=values), Kind.FORWARD_SUM, RUN, 2, [3])
+    got = decode_numbers(message(payload=doubles(*values)), Kind.FORWARD_SUM, RUN, 2, [3])
     assert got.values == values
 
 
@@ -99,8 +121,10 @@ def test_large_finite_numbers_are_not_mistaken_for_infinite_ones() -> None:
     [
         ({"version": 1}, Reason.VERSION),
         ({"version": 0}, Reason.VERSION),
-        ({"version": "2"}, Reason.VERSION),
+        ({"version": 2}, Reason.VERSION),
+        ({"version": "3"}, Reason.VERSION),
         ({"version": True}, Reason.VERSION),
+        ({"version": 3.0}, Reason.VERSION),
         ({"kind": int(Kind.BACKWARD_SUM)}, Reason.KIND),
         ({"kind": 99}, Reason.KIND),
         ({"kind": 3.0}, Reason.KIND),
@@ -117,14 +141,15 @@ def test_large_finite_numbers_are_not_mistaken_for_infinite_ones() -> None:
         ({"setpoint": -1}, Reason.SETPOINT),
         ({"setpoint": 0.0}, Reason.SETPOINT),
         ({"setpoint": 1}, Reason.LENGTH),
-        ({"payload": [1.0, 2.0]}, Reason.LENGTH),
-        ({"payload": []}, Reason.LENGTH),
-        ({"payload": [1.0, 2.0, 3]}, Reason.TYPE),
-        ({"payload": [1.0, 2.0, None]}, Reason.TYPE),
-        ({"payload": [1.0, 2.0, True]}, Reason.TYPE),
-        ({"payload": [[1.0], 2.0, 3.0]}, Reason.TYPE),
+        ({"payload": doubles(1.0, 2.0)}, Reason.LENGTH),
+        ({"payload": doubles(1.0, 2.0, 3.0, 4.0)}, Reason.LENGTH),
+        ({"payload": doubles(1.0, 2.0, 3.0)[:-1]}, Reason.LENGTH),
+        ({"payload": b""}, Reason.LENGTH),
+        ({"payload": [1.0, 2.0, 3.0]}, Reason.TYPE),
+        ({"payload": []}, Reason.TYPE),
+        ({"payload": "a" * 24}, Reason.TYPE),
         ({"payload": {"a": 1.0}}, Reason.TYPE),
-        ({"payload": b"\0" * 24}, Reason.TYPE),
+        ({"payload": 3.0}, Reason.TYPE),
         ({"payload": None}, Reason.TYPE),
         ({"extra": 1}, Reason.MALFORMED),
     ],
@@ -133,9 +158,18 @@ def test_one_wrong_field_is_refused_by_its_name(changes: dict[str, Any], reason:
     assert refusal(message(**changes)) is reason
 
 
-@given(st.integers(0, len(message()) - 1))
-def test_truncated_messages_are_refused(length: int) -> None:
-    assert refusal(message()[:length]) is Reason.MALFORMED
+GOOD = [message(), encode_numbers(Kind.FORWARD_SUM, RUN, 7, 2, 0, [1.0, 2.0, 3.0])]
+"""One message in the two forms that it may have."""
+
+
+@given(st.sampled_from(GOOD), st.data())
+def test_truncated_messages_are_refused(raw: bytes, data: st.DataObject) -> None:
+    assert refusal(raw[: data.draw(st.integers(0, len(raw) - 1))]) is Reason.MALFORMED
+
+
+@given(st.sampled_from(GOOD), st.binary(min_size=1, max_size=40))
+def test_messages_with_something_behind_them_are_refused(raw: bytes, more: bytes) -> None:
+    assert refusal(raw + more) is Reason.MALFORMED
 
 
 @given(st.binary(max_size=200) | anything.map(msgpack.packb))
@@ -181,9 +215,10 @@ def test_seven_fields_of_anything_are_refused(fields: list[Any]) -> None:
         decode_counters(raw, RUN)
 
 
-@given(st.integers(0, 8 * len(message()) - 1))
-def test_a_flipped_bit_never_passes_for_another_header(bit: int) -> None:
-    raw = bytearray(message())
+@given(st.sampled_from(GOOD), st.data())
+def test_a_flipped_bit_never_passes_for_another_header(good: bytes, data: st.DataObject) -> None:
+    raw = bytearray(good)
+    bit = data.draw(st.integers(0, 8 * len(raw) - 1))
     raw[bit // 8] ^= 1 << (bit % 8)
     try:
         got = decode_numbers(bytes(raw), Kind.FORWARD_SUM, RUN, 2, [3])
@@ -192,6 +227,180 @@ def test_a_flipped_bit_never_passes_for_another_header(bit: int) -> None:
     # What passes differs in tick or numbers only: links are checked by the transport, not here.
     assert (got.sender, got.setpoint, len(got.values)) == (2, 0, 3)
     assert all(map(math.isfinite, got.values))
+
+
+# -- messages of every tick ----------------------------------------------------------------------------------
+
+
+@given(
+    kind=control,
+    sender=senders,
+    tick=ticks,
+    setpoint=st.integers(0, 2**16 - 1),
+    values=st.lists(st.floats(), max_size=12),
+)
+def test_a_stamped_message_is_the_encoded_one_and_msgpack_of_seven_fields(
+    kind: Kind, sender: int, tick: int, setpoint: int, values: list[float]
+) -> None:
+    outgoing = Outgoing(kind, RUN, sender, len(values))
+    outgoing.values[:] = values
+    raw = outgoing.stamped(tick, setpoint)
+    assert raw == encode_numbers(kind, RUN, tick, sender, setpoint, outgoing.values.tolist())
+    *fields, payload = msgpack.unpackb(raw)
+    assert fields == [3, int(kind), RUN, tick, sender, setpoint]
+    assert payload == doubles(*values)
+
+
+@given(st.lists(st.tuples(ticks, st.integers(0, 3), finite), min_size=2, max_size=5))
+def test_messages_of_one_buffer_are_apart(messages: list[tuple[int, int, float]]) -> None:
+    """What is sent later changes nothing in what has been sent."""
+    outgoing = Outgoing(Kind.COMMAND, RUN, 4, 2)
+    sent = []
+    for tick, setpoint, value in messages:
+        outgoing.values[:] = value
+        sent.append(outgoing.stamped(tick, setpoint))
+    for (tick, setpoint, value), raw in zip(messages, sent, strict=True):
+        assert raw == encode_numbers(Kind.COMMAND, RUN, tick, 4, setpoint, [value, value])
+
+
+def test_the_header_is_32_bytes_and_the_doubles_behind_it_are_aligned() -> None:
+    assert HEADER_BYTES == 32
+    for kind in (Kind.MEASUREMENT, Kind.COMMAND, Kind.FORWARD_SUM, Kind.BACKWARD_SUM):
+        for tick, sender in ((0, PLANT), (127, 0), (128, 200), (2**53, 10_000)):
+            raw = encode_numbers(kind, RUN, tick, sender, 2, [1.0, 2.0])
+            assert len(raw) == 32 + 16
+            assert raw[32:] == doubles(1.0, 2.0)
+            values = numbers_of(raw)
+            assert values.flags.aligned
+            assert values.ctypes.data % 8 == 0
+    assert Outgoing(Kind.COMMAND, RUN, 0, 3).values.flags.aligned
+
+
+@given(st.lists(st.floats(), max_size=12))
+def test_the_numbers_of_a_message_have_its_bits_and_are_read_only(values: list[float]) -> None:
+    raw = encode_numbers(Kind.COMMAND, RUN, 3, 1, 0, values)
+    got = numbers_of(raw)
+    assert bits(got) == bits(values)
+    assert not got.flags.writeable
+
+
+identity = st.fixed_dictionaries(
+    {
+        "kind": control,
+        "run": st.integers(0, 2**63 - 1),
+        "tick": ticks,
+        "sender": senders,
+        "setpoint": st.integers(0, 2),
+        "count": st.integers(1, 6),
+    }
+)
+
+
+def encoded(who: dict[str, Any]) -> bytes:
+    return encode_numbers(
+        who["kind"], who["run"], who["tick"], who["sender"], who["setpoint"], [0.5] * who["count"]
+    )
+
+
+def receiver(who: dict[str, Any]) -> Incoming:
+    """One that waits for this message; the sums of its setpoints differ in length."""
+    lengths = [who["count"] + setpoint - who["setpoint"] for setpoint in range(3)]
+    incoming = Incoming(who["kind"], who["run"], who["sender"], [max(0, n) for n in lengths])
+    incoming.expect(who["tick"], who["setpoint"])
+    return incoming
+
+
+@given(
+    identity,
+    identity,
+    st.sets(st.sampled_from(["kind", "run", "tick", "sender", "setpoint", "count"])),
+)
+def test_exactly_the_message_that_is_expected_is_due(
+    who: dict[str, Any], other: dict[str, Any], fields: set[str]
+) -> None:
+    came = who | {field: other[field] for field in fields}
+    assert receiver(who).due(encoded(came)) == (came == who)
+
+
+@given(identity, st.integers(0, HEADER_BYTES - 1), st.integers(1, 255))
+def test_no_byte_of_the_header_may_be_another(who: dict[str, Any], at: int, change: int) -> None:
+    raw = bytearray(encoded(who))
+    raw[at] ^= change
+    assert not receiver(who).due(bytes(raw))
+
+
+@given(identity, st.integers(-40, 40).filter(bool))
+def test_a_message_that_is_due_has_its_length(who: dict[str, Any], more: int) -> None:
+    raw = encoded(who)
+    assert not receiver(who).due(raw[:more] if more < 0 else raw + bytes(more))
+
+
+@given(identity, st.lists(st.floats(), min_size=6, max_size=6))
+def test_any_doubles_may_be_in_a_message_that_is_due(
+    who: dict[str, Any], values: list[float]
+) -> None:
+    """Whether they are finite is checked by those who use them, see `decode_numbers` and node.block."""
+    raw = encoded(who)[:HEADER_BYTES] + doubles(*values[: who["count"]])
+    assert receiver(who).due(raw)
+    assert bits(numbers_of(raw)) == bits(values[: who["count"]])
+
+
+@given(identity, identity)
+def test_what_is_expected_changes_with_every_call(
+    who: dict[str, Any], later: dict[str, Any]
+) -> None:
+    incoming = Incoming(who["kind"], who["run"], who["sender"], [who["count"]] * 3)
+    for now in (who, who | {"tick": later["tick"], "setpoint": later["setpoint"]}, who):
+        incoming.expect(now["tick"], now["setpoint"])
+        for one in (who, later):
+            came = who | {"tick": one["tick"], "setpoint": one["setpoint"]}
+            assert incoming.due(encoded(came)) == (came == now)
+
+
+@given(identity)
+def test_another_encoding_of_a_message_is_not_due_but_decodes_to_the_same_numbers(
+    who: dict[str, Any],
+) -> None:
+    """msgpack writes integers as short as they are: the same message for `decode`."""
+    raw = encoded(who)
+    again = bytes(msgpack.packb(msgpack.unpackb(raw)))
+    incoming = receiver(who)
+    assert incoming.decode(again) == incoming.decode(raw)
+    assert incoming.decode(raw).values == [0.5] * who["count"]
+    assert incoming.due(raw)
+    assert incoming.due(again) == (raw == again)
+
+
+@given(st.binary(max_size=200) | anything.map(msgpack.packb))
+def test_a_receiver_decodes_or_refuses_as_decode_numbers_does(raw: bytes) -> None:
+    incoming = Incoming(Kind.FORWARD_SUM, RUN, 2, [3, 5])
+    assert not incoming.due(raw)
+    with pytest.raises(RejectedError) as caught:
+        incoming.decode(raw)
+    assert caught.value.reason is refusal(raw)
+
+
+@pytest.mark.parametrize("more", [1, 100])
+def test_more_numbers_than_a_message_carries_are_refused(more: int) -> None:
+    too_many = MOST_NUMBERS + more
+    with pytest.raises(ValueError, match=f"at most {MOST_NUMBERS} numbers, not {too_many}"):
+        Outgoing(Kind.MEASUREMENT, RUN, PLANT, too_many)
+    with pytest.raises((ValueError, struct.error)):
+        encode_numbers(Kind.MEASUREMENT, RUN, 0, PLANT, 0, [0.0] * too_many)
+
+
+def test_as_many_numbers_as_a_message_carries_come_back() -> None:
+    outgoing = Outgoing(Kind.MEASUREMENT, RUN, PLANT, MOST_NUMBERS)
+    outgoing.values[:] = np.random.default_rng(1).standard_normal(MOST_NUMBERS)
+    raw = outgoing.stamped(5, 1)
+    incoming = Incoming(Kind.MEASUREMENT, RUN, PLANT, [MOST_NUMBERS] * 2)
+    incoming.expect(5, 1)
+    assert incoming.due(raw)
+    assert np.array_equal(numbers_of(raw), outgoing.values)
+    assert incoming.decode(raw).values == outgoing.values.tolist()
+
+
+# -- the other kinds ------------------------------------------------------------------------------------------
 
 
 @given(rows=st.integers(1, 6), columns=st.integers(1, 9), seed=st.integers(0, 99))
