@@ -102,6 +102,7 @@ class NodeProcess:
         self._instants = instants
         self._filled = 0
         self._batch_began_ns = 0
+        self._epoch_ns = config.links.epoch_ns
         # Nodes send their batches at different ticks, so that the recorder's link sees no bursts.
         self._quota = 1 + (config.index * config.batch_ticks) // config.nodes
 
@@ -295,7 +296,9 @@ class NodeProcess:
     def _record(self, tick: int, row: list[float]) -> None:
         rows, filled = self._rows, self._filled
         rows[filled] = row
-        rows[filled, -self._instants :] -= self._config.links.epoch_ns
+        if self._epoch_ns is None:  # another machine's clock: its first measurement came at zero
+            self._epoch_ns = int(row[-self._instants])
+        rows[filled, -self._instants :] -= self._epoch_ns
         sent_ns = int(row[-1])
         if filled == 0:
             self._batch_began_ns = sent_ns

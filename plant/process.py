@@ -196,7 +196,7 @@ class PlantProcess:
             self._record(
                 k,
                 row,
-                started_ns - self._config.links.epoch_ns,
+                started_ns - (self._config.links.epoch_ns or 0),
                 self._complete_ns - started_ns,
                 now_ns - advance_ns,
             )
