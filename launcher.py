@@ -53,6 +53,7 @@ def run(
     deadline: float = RunOptions.deadline_s,
     by_hand: Ints = RunOptions.by_hand,
     no_pin: Flag = False,
+    hosts: Path | None = RunOptions.hosts,
 ) -> int:
     """Run the arm: one process a segment, a plant and a recorder; leaves a recording and a plot.
 
@@ -86,6 +87,7 @@ def run(
         deadline: Longest wait within a tick, in seconds, before the run is stopped.
         by_hand: A node that you start yourself; may be given several times.
         no_pin: Leave the nodes' cores to the scheduler.
+        hosts: Hosts file (TOML): which nodes run on which machine, over TCP; see docs/hosts.md.
     """
     from supervise.execute import execute
 
@@ -112,6 +114,7 @@ def run(
         deadline_s=deadline,
         by_hand=by_hand,
         pin=not no_pin,
+        hosts=hosts,
     )
     result = execute(options, quiet=quiet or json, plot=not no_plot)
     outcome = result.outcome

@@ -23,6 +23,7 @@ from deploy import Deployment, SegmentGrid, deploy
 from deploy.path import References, make_references
 from supervise.endpoints import Endpoints
 from supervise.factors_file import factors_json
+from supervise.hosts import Host, this_machine
 from supervise.options import RunOptions
 from supervise.scenario import Course, settle
 from supervise.spacing import spacing_name
@@ -57,8 +58,14 @@ class Plan:
     endpoints: Endpoints
     directory: Path
     """Where the recording and everything else about the run goes."""
+    hosts: tuple[Host, ...]
+    """In the order of their segments; one, this machine, without a hosts file."""
     by_hand: frozenset[int]
     start_timeout_s: float
+
+    def host_of(self, node: int) -> Host:
+        """The host that a node runs on."""
+        return next(host for host in self.hosts if node in host.indices)
 
 
 def new_run_id() -> str:
@@ -157,15 +164,19 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
     )
     epoch_ns = time.monotonic_ns()
     cores = _cores(nodes) if options.pin else [None] * nodes
+    placed = options.placed_on
+    hosts = (this_machine(nodes),) if placed is None else placed.hosts
+    # Of another machine neither clock nor cores are known.
+    elsewhere = {i for host in hosts if host.own_clock for i in host.indices}
 
-    def links(listen: list[str], connect: list[str], cpu: int | None = None) -> LinkConfig:
+    def links(listen: list[str], connect: list[str], node: int | None = None) -> LinkConfig:
         return LinkConfig(
             listen=tuple(listen),
             connect=tuple(connect),
             directory=endpoints.private,
             deadline_s=options.deadline_s,
-            epoch_ns=epoch_ns,
-            cpu=cpu,
+            epoch_ns=None if node in elsewhere else epoch_ns,
+            cpu=None if node is None or node in elsewhere else cores[node],
         )
 
     def node(i: int) -> NodeConfig:
@@ -179,7 +190,7 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             setpoint=active,
             scheduling=run.scheduling,
             batch_ticks=BATCH_TICKS,
-            links=links(listen, connect, cores[i]),
+            links=links(listen, connect, i),
             factors=deployment.nodes[i].to_plain(),
             reference=references.nodes[i].to_plain(),
         )
@@ -201,7 +212,7 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             forward_widths=tuple(f.forward_received for f in deployment.nodes),
             backward_widths=tuple(f.backward_received for f in deployment.nodes),
             flush_s=FLUSH_S,
-            metadata=_metadata(run, epoch_ns),
+            metadata=_metadata(run, epoch_ns, () if placed is None else hosts),
             attachments={
                 "gains.json": options.gains.read_text(),
                 "run.json": dumps(run),
@@ -211,7 +222,8 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         ),
         endpoints=endpoints,
         directory=directory,
-        by_hand=frozenset(options.by_hand),
+        hosts=hosts,
+        by_hand=frozenset(options.by_hand).union(*(h.indices for h in hosts if h.by_hand)),
         start_timeout_s=options.start_timeout_s,
     )
 
@@ -225,11 +237,15 @@ def _cores(nodes: int) -> list[int | None]:
     return [pair[i * len(pair) // nodes] for i in range(nodes)]
 
 
-def _metadata(run: RunConfig, epoch_ns: int) -> dict[str, str]:
+def _metadata(run: RunConfig, epoch_ns: int, hosts: tuple[Host, ...]) -> dict[str, str]:
     """The record "octarm": what the recording must say about where it came from."""
     packages = ("octarm", "numpy", "eclipse-zenoh", "msgpack", "mcap", "msgspec")
     versions = {name: _version(name) for name in packages}
     versions["python"] = platform.python_version()
+    places = [
+        {"name": h.name, "address": h.address, "nodes": h.nodes, "own_clock": h.own_clock}
+        for h in hosts
+    ]
     return {
         "format_version": str(FORMAT_VERSION),
         "run_id": run.run_id,
@@ -240,7 +256,7 @@ def _metadata(run: RunConfig, epoch_ns: int) -> dict[str, str]:
         "epoch_ns": str(epoch_ns),
         "started_at": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "machine": platform.machine(),
-    }
+    } | ({"hosts": json.dumps(places)} if hosts else {})
 
 
 def _version(name: str) -> str:
