@@ -11,6 +11,7 @@ import argparse
 import contextlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -52,6 +53,7 @@ class Lab:
         self._count = 0
 
     def __enter__(self) -> Self:
+        _sweep()
         try:
             for space in self._spaces.values():
                 ip("netns", "add", space)
@@ -127,6 +129,16 @@ class Lab:
         )
         device = json.loads(shown.stdout)[0]["dev"]
         ip("-n", space, "route", "replace", peer, "dev", device, "rto_min", f"{milliseconds}ms")
+
+
+def _sweep() -> None:
+    """Remove the namespaces of processes that were killed."""
+    listed = subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=False)
+    for line in listed.stdout.splitlines():
+        space = line.split()[0]
+        found = re.fullmatch(r"octarm-(\d+)-\w+", space)
+        if found and not Path("/proc", found[1]).exists():
+            subprocess.run(["ip", "netns", "del", space], capture_output=True, check=False)
 
 
 def ip(*words: str) -> None:

@@ -230,7 +230,7 @@ class Conductor:
         # Last the zygotes, which end whatever they have forked in the meantime.
         if self._zygote is not None:
             self._zygote.control.close()
-        self._await_end([*self._far.values()], ZYGOTE_GRACE_S)
+        self._await_end([far for far in self._far.values() if far.up], ZYGOTE_GRACE_S)
         self._end(signal.SIGTERM, [self._zygote, *self._far.values()], ZYGOTE_GRACE_S)
         self._end(signal.SIGKILL, [self._zygote, *self._far.values(), *own])
         for process in (self._zygote, *self._far.values(), self._plant, self._recorder):
@@ -321,6 +321,7 @@ class Conductor:
         state.hear(line)
         match line["event"]:
             case "up" if isinstance(process, FarZygote) and line["from"] == process.name:
+                process.up = True
                 # Not before somebody reads there.
                 self._selector.register(
                     process.control, selectors.EVENT_WRITE, lambda: self._push(process)

@@ -47,6 +47,8 @@ class FarZygote(Process):
         self._sent_at = monotonic()
         self._known = {"zygote", *(f"node {index}" for index in host.indices)}
         self.nodes: list[FarNode] = []
+        self.up = False
+        """Whether the zygote there has answered."""
         for descriptor in (self.errors, self.control.fileno()):
             os.set_blocking(descriptor, False)
 
@@ -71,8 +73,9 @@ class FarZygote(Process):
     def beat(self) -> None:
         """Say from time to time that the launcher lives."""
         if not (self._unsent or self.control.closed) and monotonic() - self._sent_at > BEAT_S:
-            self.tell("")
+            self._unsent = b"\n"
             self.push()
+            self._unsent = b""  # without room now: another beat comes
 
     def let_go(self) -> None:
         """Close the control pipe: everything that was started there ends."""
