@@ -322,10 +322,10 @@ class Conductor:
         match line["event"]:
             case "up" if isinstance(process, FarZygote) and line["from"] == process.name:
                 process.up = True
-                # Not before somebody reads there.
-                self._selector.register(
-                    process.control, selectors.EVENT_WRITE, lambda: self._push(process)
-                )
+                if not self._leaving:  # not before somebody reads there
+                    self._selector.register(
+                        process.control, selectors.EVENT_WRITE, lambda: self._push(process)
+                    )
             case "born":
                 node = line["node"]
                 state.nodes[node] = process.adopt(f"node {node}", line["pid"])

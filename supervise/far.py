@@ -108,9 +108,9 @@ class FarZygote(Process):
             status = json.loads(line)
         except ValueError:
             return None
-        if not isinstance(status, dict) or status.get("from") not in self._known:
+        if not isinstance(status, dict) or "event" not in status:
             return None
-        if "event" not in status:
+        if not any(status.get("from") == name for name in self._known):
             return None
         if status["from"] == "zygote":
             status["from"] = self.name

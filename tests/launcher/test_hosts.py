@@ -23,7 +23,7 @@ from analysis.recording import read_recording
 if TYPE_CHECKING:
     from conftest import Cli, Start
 
-LIKE_SSH = """sh -c 'echo welcome; cat | {}"$@"' far"""
+SSH = f"{sys.executable} {Path(__file__).with_name('stand_in_ssh.py')} tip-side"
 """Its process is not the zygote: only the pipes bind the two, and the words pass a shell."""
 ENDLESS = ("--nodes", "4", "--ticks", "1000000", "--no-plot")
 
@@ -70,7 +70,7 @@ def nothing_left(cli: Cli) -> None:
 
 def test_a_far_half_gives_the_same_numbers(start: Start, tmp_path: Path) -> None:
     same = ["--nodes", "4", "--ticks", "60", "--no-plot", "--quiet"]
-    hosts = write_hosts(tmp_path, LIKE_SSH.format(""))
+    hosts = write_hosts(tmp_path, SSH)
     near, far = start.run(*same), start.run(*same, "--hosts", hosts)
     assert [near.finish(), far.finish()] == [0, 0], near.err + far.err
     nothing_left(far)
@@ -89,9 +89,9 @@ def test_a_far_half_gives_the_same_numbers(start: Start, tmp_path: Path) -> None
 
 
 def test_a_killed_start_command_stops_the_arm(start: Start, tmp_path: Path) -> None:
-    cli = start.run(*ENDLESS, "--hosts", write_hosts(tmp_path, LIKE_SSH.format("")))
+    cli = start.run(*ENDLESS, "--hosts", write_hosts(tmp_path, SSH))
     cli.wait_for("tick ")
-    os.kill(cli.processes()["sh"], signal.SIGKILL)
+    os.kill(cli.processes()["stand-in-ssh"], signal.SIGKILL)
     assert cli.finish() == 4
     assert "host tip-side was ended by SIGKILL" in cli.err
     nothing_left(cli)
@@ -102,7 +102,7 @@ def test_a_killed_start_command_stops_the_arm(start: Start, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("node", [2, 3])
 def test_a_killed_far_node_stops_the_arm(start: Start, tmp_path: Path, node: int) -> None:
-    cli = start.run(*ENDLESS, "--hosts", write_hosts(tmp_path, LIKE_SSH.format("")))
+    cli = start.run(*ENDLESS, "--hosts", write_hosts(tmp_path, SSH))
     cli.wait_for("tick ")
     os.kill(cli.processes()[f"octarm-node{node}"], signal.SIGKILL)
     assert cli.finish() == 4
@@ -114,12 +114,23 @@ def test_a_killed_far_node_stops_the_arm(start: Start, tmp_path: Path, node: int
 def test_an_ended_launcher_leaves_nothing_on_the_other_side(
     start: Start, tmp_path: Path, number: signal.Signals
 ) -> None:
-    cli = start.run(*ENDLESS, "--hosts", write_hosts(tmp_path, LIKE_SSH.format("")))
+    cli = start.run(*ENDLESS, "--hosts", write_hosts(tmp_path, SSH))
     cli.wait_for_records()
     cli.popen.send_signal(number)
     assert cli.finish() == (130 if number == signal.SIGINT else -signal.SIGKILL)
     nothing_left(cli)
     assert read_recording(cli.recording()).ticks > 0
+
+
+def test_an_interrupt_before_a_slow_host_answers(start: Start, tmp_path: Path) -> None:
+    """It answers while everything ends, and takes no notice of a signal before."""
+    hosts = write_hosts(tmp_path, """sh -c 'trap \"\" TERM; sleep 2; exec \"$@\"' far""")
+    cli = start.run("--nodes", "4", "--ticks", "5", "--hosts", hosts, "--by-hand", "0")
+    cli.wait_for("node 0 is yours to start: ")
+    cli.popen.send_signal(signal.SIGINT)
+    assert cli.finish() == 130
+    assert "interrupted before the first tick" in cli.err
+    nothing_left(cli)
 
 
 def test_a_start_command_that_fails_is_named_with_its_last_words(
@@ -268,7 +279,7 @@ def test_a_cut_link_between_hosts_stops_the_arm(
 ) -> None:
     """Nobody dies and nobody is told: the deadline of the tick is what ends the run."""
     link = lab.lossy("a", A, "b", B, Loss())
-    hosts = between_hosts(lab, tmp_path, 4, LIKE_SSH)
+    hosts = between_hosts(lab, tmp_path, 4, SSH + " {}")
     options = (*ENDLESS, "--hosts", hosts, "--deadline", "3")
     cli = start.run(*options, within=lab.within("plant"))
     cli.wait_for("tick ")
