@@ -58,6 +58,7 @@ def run(
     segments_per_process: int = RunOptions.segments_per_process,
     sched: Literal["other", "fifo"] = "other",
     no_pin: Flag = False,
+    hosts: Path | None = RunOptions.hosts,
 ) -> int:
     """Run the arm: one process a segment, a plant and a recorder; leaves a recording and a plot.
 
@@ -97,6 +98,7 @@ def run(
         segments_per_process: Several segments in one process hand their sums on in memory.
         sched: Scheduling of plant and nodes: other (ordinary) or fifo (real-time, where it is permitted).
         no_pin: Leave the nodes' cores to the scheduler.
+        hosts: Hosts file (TOML): which nodes run on which machine, over TCP; see docs/hosts.md.
     """
     from supervise.execute import execute
 
@@ -128,6 +130,7 @@ def run(
         realtime=realtime,
         period_s=period,
         hold_ticks=hold_ticks,
+        hosts=hosts,
     )
     result = execute(options, quiet=quiet or json, plot=not no_plot)
     outcome = result.outcome

@@ -1,5 +1,5 @@
-"""`python -m node CONFIGURATION` starts one node by hand; `python -m node --zygote` is what the
-launcher uses."""
+"""`python -m node CONFIGURATION` starts one node by hand, on any machine; `python -m node --zygote` is what
+the launcher uses."""
 
 from __future__ import annotations
 
@@ -23,17 +23,22 @@ def main() -> int:
     """Run one node, or the zygote; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m node", description=__doc__)
     parser.add_argument(
-        "configuration", nargs="?", type=Path, help="JSON file written by the launcher"
+        "configuration",
+        nargs="?",
+        help="JSON file written by the launcher; - for standard input",
     )
     parser.add_argument(
         "--zygote", action="store_true", help="serve the launcher on standard input"
+    )
+    parser.add_argument(
+        "--remote", action="store_true", help="with --zygote: the launcher is on another machine"
     )
     parser.add_argument("--parent", type=int, default=os.getppid(), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.zygote:
         from node.zygote import serve
 
-        return serve(arguments.parent)
+        return serve(None if arguments.remote else arguments.parent)
     if arguments.configuration is None:
         parser.error("give a configuration file or --zygote")
     try:
@@ -43,12 +48,13 @@ def main() -> int:
         return int(error.exit_code)
 
 
-def _by_hand(path: Path) -> int:
+def _by_hand(name: str) -> int:
+    where = "configuration on standard input" if name == "-" else f"configuration {name}"
     try:
-        text = path.read_bytes()
+        text = sys.stdin.buffer.read() if name == "-" else Path(name).read_bytes()
     except OSError as error:
-        raise UsageError(f"configuration {path}: {error.strerror or error}") from None
-    config = loads(NodeConfig, text, f"configuration {path}")
+        raise UsageError(f"{where}: {error.strerror or error}") from None
+    config = loads(NodeConfig, text, where)
     name_process(f"octarm-node{config.index}")
     child = Child(f"node {config.index}", control=-1, status=1, directory=None)
     child.install(reads_control=False)

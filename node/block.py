@@ -67,7 +67,7 @@ class SegmentBlock:
     """Consecutive segments within their tick. Not thread-safe: the process around it holds a lock.
 
     A segment's row is y (2), xh (4), u, setpoint, bump, c, d, then the instants on the monotonic clock, in
-    ns after `epoch_ns`, at which the measurement, c (unless it is the root's), d (unless the tip's) came and
+    ns after `epoch_ns` (None: after the first measurement), at which the measurement, c (unless it is the root's), d (unless the tip's) came and
     the command left. `batch` rows are handed over at once, the first time `first_batch`.
     """
 
@@ -78,7 +78,7 @@ class SegmentBlock:
         *,
         batch: int = 1,
         first_batch: int | None = None,
-        epoch_ns: int = 0,
+        epoch_ns: int | None = 0,
     ) -> None:
         _check_chain(sweeps)
         self.tick = 0
@@ -240,6 +240,8 @@ class SegmentBlock:
             commands[i] = output[STATES]
         outlet.send_commands(self.tick, self._root.next_setpoint)
         sent_ns = monotonic_ns()
+        if self._epoch_ns is None:  # another machine's clock
+            self._epoch_ns = self._y_ns
         epoch = self._epoch_ns
         instants = [self._y_ns - epoch, self._c_ns - epoch, self._d_ns - epoch, sent_ns - epoch]
         for sweep in sweeps:

@@ -1,8 +1,9 @@
-"""The process that all nodes of a run on this machine are forked from: modules are loaded once, not
+"""The process that all nodes of a run on one machine are forked from: modules are loaded once, not
 n times.
 
 The launcher writes one node configuration a line to its standard input; each becomes a child
-process. Births and deaths go to the launcher as status lines.
+process. Births and deaths go to the launcher as status lines. On another machine than the launcher's the
+two pipes come from a start command, ssh for example, and are all that binds the two.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import traceback
 
 # Everything a node needs is loaded here, before the first fork.
 from node.process import NodeProcess
-from wire.child import Child, die_with_parent, name_process, send_status
+from wire.child import Child, Deadline, die_with_parent, name_process, send_status
 from wire.errors import ExitCode, OctarmError
 from wire.run_config import NodeConfig, loads
 
@@ -23,9 +24,18 @@ GRACE_S = 1.0
 """Between the request to end and the end by force, when the zygote itself has to stop its nodes."""
 
 
-def serve(parent: int) -> int:
-    """Fork a node a line until the launcher says stop or is gone; returns the exit code."""
-    die_with_parent(parent)
+SILENCE_S = 30.0
+"""A remote launcher writes an empty line more often than this (supervise.far); without one it is lost,
+though nobody has closed the pipe."""
+
+
+def serve(parent: int | None) -> int:
+    """Fork a node a line until the launcher says stop or is gone; returns the exit code.
+
+    `parent` is the launcher's process; None: it is on another machine.
+    """
+    if parent is not None:
+        die_with_parent(parent)
     name_process("octarm-zygote")
     child = Child("zygote", control=0, status=1, directory=None)
     signal.signal(signal.SIGCHLD, lambda _number, _frame: None)
@@ -33,9 +43,15 @@ def serve(parent: int) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     alive: dict[int, int] = {}
     child.status("up")
+    silence = Deadline(SILENCE_S)
     while not child.stopping:
-        for line in child.wait_lines(None):
-            if not child.stopping:
+        lines = child.wait_lines(None if parent is not None else silence.left)
+        if lines:
+            silence = Deadline(SILENCE_S)
+        elif parent is None and silence.passed:
+            break
+        for line in lines:
+            if line and not child.stopping:
                 _birth(line, child, alive)
         _reap(child, alive)
     _end(child, alive)
@@ -75,7 +91,7 @@ def run_node(config: NodeConfig, parent: int) -> int:
         finally:
             child.leave(list(config.links.listen))
     except OctarmError as error:
-        send_status(1, name, "failed", code="configuration", message=str(error))
+        send_status(1, name, "failed", code="configuration", message=f"{name}: {error}")
         return int(error.exit_code)
     except Exception as error:
         traceback.print_exc()

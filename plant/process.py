@@ -278,7 +278,7 @@ class PlantProcess:
     def _add(self, k: int, state: Array, timing: tuple[int, int, int, int]) -> None:
         """Record a tick: instants due and begun, then how long sweep and emulation took."""
         due_ns, began_ns, sweep_ns, advance_ns = timing
-        epoch_ns = self._config.links.epoch_ns
+        epoch_ns = self._config.links.epoch_ns or 0
         self._record.add(k, state, (due_ns - epoch_ns, began_ns - epoch_ns, sweep_ns, advance_ns))
         self._done = k + 1
         if began_ns - self._told_ns > PROGRESS_NS:

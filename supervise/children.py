@@ -14,6 +14,7 @@ import select
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -59,10 +60,28 @@ class Handle:
             self._fd = -1
 
 
-class Process(Handle):
-    """A direct child: a Python module of this project with pipes for control and status."""
+class FarNode:
+    """A node on another host, known by hearsay: no signal reaches it."""
 
-    def __init__(self, name: str, module: str, arguments: list[str], log: IO[bytes]) -> None:
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.alive = True
+
+    def close(self) -> None:
+        """It is gone, or nobody knows any more."""
+        self.alive = False
+
+
+class Process(Handle):
+    """A direct child with pipes for control and status, usually a Python module of this project."""
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        errors: IO[bytes] | int,
+        directory: Path | None = PYTHON_ROOT,
+    ) -> None:
         environment = dict(os.environ)
         environment["OPENBLAS_NUM_THREADS"] = "1"
         environment["PYTHONUNBUFFERED"] = "1"
@@ -71,11 +90,11 @@ class Process(Handle):
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             self._popen = subprocess.Popen(
-                [sys.executable, "-m", module, *arguments],
+                command,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=log,
-                cwd=PYTHON_ROOT,
+                stderr=errors,
+                cwd=directory,
                 env=environment,
                 start_new_session=True,  # Ctrl-C is for the launcher alone
             )
@@ -112,6 +131,10 @@ class Process(Handle):
         *whole, self._partial = (self._partial + data).split(b"\n")
         return [json.loads(line) for line in whole]
 
+    def adopt(self, name: str, pid: int, /) -> Handle | FarNode:
+        """The handle of a process that this one has forked."""
+        return Handle(name, pid, parent=self.pid)
+
     def reap(self) -> int | None:
         """The exit code once the process has ended (minus the signal's number), else None."""
         return self._popen.poll()
@@ -123,6 +146,11 @@ class Process(Handle):
                 with contextlib.suppress(OSError):
                     pipe.close()
         super().close()
+
+
+def module(name: str, *arguments: str) -> list[str]:
+    """The command that runs a module of this project."""
+    return [sys.executable, "-m", name, *arguments]
 
 
 def _parent_of(pid: int) -> int | None:

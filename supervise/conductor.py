@@ -17,7 +17,9 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Self
 
-from supervise.children import Handle, Process, ending
+from supervise.by_hand import explain, offer
+from supervise.children import FarNode, Handle, Process, ending, module
+from supervise.far import FarZygote
 from supervise.plan import Plan
 from supervise.state import Outcome, RunState
 from supervise.view import View
@@ -53,6 +55,8 @@ class Conductor:
         self._log_path = plan.directory / "processes.log"
         self._log = self._log_path.open("ab")
         self._zygote: Process | None = None
+        self._far: dict[str, FarZygote] = {}
+        """By the names of their hosts."""
         self._plant: Process | None = None
         self._recorder: Process | None = None
         self._state = RunState(plan)
@@ -124,24 +128,38 @@ class Conductor:
     def _spawn(self) -> None:
         plan = self._plan
         own = str(os.getpid())
-        self._zygote = self._start("zygote", "node", ["--zygote", "--parent", own])
-        self._plant = self._start("plant", "plant", [own])
-        self._recorder = self._start("recorder", "recorder", [own])
+        for host in plan.hosts:
+            if host.start:
+                self._far[host.name] = far = FarZygote(host, self._log)
+                self._follow(far)
+                self._selector.register(
+                    far.errors, selectors.EVENT_READ, lambda far=far: self._read_errors(far)
+                )
+        if any(host.local for host in plan.hosts):
+            self._zygote = self._start("zygote", "node", "--zygote", "--parent", own)
+        self._plant = self._start("plant", "plant", own)
+        self._recorder = self._start("recorder", "recorder", own)
         self._plant.tell(dumps(plan.plant))
         self._recorder.tell(dumps(plan.recorder))
-        for config in plan.nodes:
-            if config.index in plan.by_hand:
-                path = plan.directory / f"node-{config.index}.json"
-                path.write_text(dumps(config) + "\n")
-                self._view.note(f"node {config.index} is yours to start: python -m node {path}")
-            else:
-                self._zygote.tell(dumps(config))
+        for host in plan.hosts:
+            zygote = self._far.get(host.name, self._zygote)
+            hand = plan.by_hand.intersection(host.indices)
+            if hand and not host.local:
+                self._view.note(explain(plan, host))
+            for index in host.indices:
+                if index in hand:
+                    self._view.note(offer(plan, plan.nodes[index]))
+                elif zygote is not None:
+                    zygote.tell(dumps(plan.nodes[index]))
 
-    def _start(self, name: str, module: str, arguments: list[str]) -> Process:
-        process = Process(name, module, arguments, self._log)
+    def _start(self, name: str, room: str, *arguments: str) -> Process:
+        process = Process(name, module(room, *arguments), self._log)
+        self._follow(process)
+        return process
+
+    def _follow(self, process: Process) -> None:
         self._selector.register(process.status, selectors.EVENT_READ, lambda: self._read(process))
         self._selector.register(process, selectors.EVENT_READ, lambda: self._gone(process))
-        return process
 
     def _wait_linked(self, limit: Deadline) -> None:
         state = self._state
@@ -205,14 +223,18 @@ class Conductor:
     def _end_all(self) -> None:
         """SIGINT, SIGTERM, SIGKILL, each with a grace, to what this run started and still lives."""
         self._order(self._plant, do="end")
+        for far in self._far.values():  # no signal reaches their nodes; they end meanwhile
+            self._let_go(far)
+        own = [h for h in self._state.nodes.values() if isinstance(h, Handle)]
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-            self._end(number, [*self._state.nodes.values(), self._plant, self._recorder])
-        # Last the zygote, which ends whatever it has forked in the meantime.
+            self._end(number, [*own, self._plant, self._recorder])
+        # Last the zygotes, which end whatever they have forked in the meantime.
         if self._zygote is not None:
             self._zygote.control.close()
-        self._end(signal.SIGTERM, [self._zygote], ZYGOTE_GRACE_S)
-        self._end(signal.SIGKILL, [self._zygote, *self._state.nodes.values()])
-        for process in (self._zygote, self._plant, self._recorder):
+        self._await_end([far for far in self._far.values() if far.up], ZYGOTE_GRACE_S)
+        self._end(signal.SIGTERM, [self._zygote, *self._far.values()], ZYGOTE_GRACE_S)
+        self._end(signal.SIGKILL, [self._zygote, *self._far.values(), *own])
+        for process in (self._zygote, *self._far.values(), self._plant, self._recorder):
             if process is not None:
                 self._forget(process)
                 process.reap()
@@ -231,8 +253,11 @@ class Conductor:
         living = [handle for handle in handles if handle is not None and handle.alive]
         for handle in living:
             handle.signal(number)
+        self._await_end(living, grace_s)
+
+    def _await_end(self, handles: Sequence[Handle], grace_s: float) -> None:
         limit = Deadline(grace_s if self._interrupts < 2 else 0.2)
-        while not limit.passed and any(handle.alive for handle in living):
+        while not limit.passed and any(handle.alive for handle in handles):
             self._turn(min(0.05, limit.left))
 
     # -- events -----------------------------------------------------------------------------------
@@ -242,13 +267,26 @@ class Conductor:
         for key, _ in self._selector.select(seconds):
             act: Callable[[], None] = key.data
             act()
+        for far in self._far.values():
+            far.beat()
 
     def _forget(self, process: Process) -> None:
-        for item in (process, process.status):
-            try:
+        for item in (process, process.status, getattr(process, "errors", -1)):
+            with contextlib.suppress(KeyError, ValueError):
                 self._selector.unregister(item)
-            except (KeyError, ValueError):
-                continue
+
+    def _let_go(self, far: FarZygote) -> None:
+        with contextlib.suppress(KeyError, ValueError):
+            self._selector.unregister(far.control)
+        far.let_go()
+
+    def _push(self, far: FarZygote) -> None:
+        if far.push():
+            self._selector.unregister(far.control)
+
+    def _read_errors(self, far: FarZygote) -> None:
+        if not far.read_errors():
+            self._selector.unregister(far.errors)
 
     def _gone(self, process: Process) -> None:
         """A direct child has ended: read its last words, remember how if nobody asked it to."""
@@ -258,9 +296,15 @@ class Conductor:
             self._selector.unregister(process)
         except KeyError:
             return
+        how = ending(code)
+        if isinstance(process, FarZygote):
+            process.read_errors()
+            how += process.last_words
+            for node in process.nodes:
+                node.close()
         expected = self._leaving or (process is self._recorder and self._state.closed is not None)
         if not expected:
-            self._state.ended[process.name] = ending(code)
+            self._state.ended[process.name] = how
             if process is self._recorder and self._state.all_linked:
                 self._view.note(f"the recorder {ending(code)}: the run goes on unrecorded")
 
@@ -271,17 +315,27 @@ class Conductor:
                 self._selector.unregister(process.status)
             return
         for line in lines:
-            self._handle(line)
+            self._handle(process, line)
 
-    def _handle(self, line: dict[str, Any]) -> None:
+    def _handle(self, process: Process, line: dict[str, Any]) -> None:
         state = self._state
         state.hear(line)
         match line["event"]:
-            case "born" if self._zygote is not None:
+            case "up" if isinstance(process, FarZygote) and line["from"] == process.name:
+                process.up = True
+                if not self._leaving:  # not before somebody reads there
+                    self._selector.register(
+                        process.control, selectors.EVENT_WRITE, lambda: self._push(process)
+                    )
+            case "born":
                 node = line["node"]
-                state.nodes[node] = Handle(f"node {node}", line["pid"], parent=self._zygote.pid)
-            case "died" if not self._leaving:
-                state.ended[f"node {line['node']}"] = ending(line["code"])
+                state.nodes[node] = process.adopt(f"node {node}", line["pid"])
+            case "died":
+                node = line["node"]
+                if isinstance(far := state.nodes[node], FarNode):
+                    far.close()
+                if not self._leaving:
+                    state.ended[f"node {node}"] = ending(line["code"])
             case "progress" if line["from"] == "plant":
                 self._view.progress(line["tick"])
             case "progress":

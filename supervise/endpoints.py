@@ -1,4 +1,5 @@
-"""Where the processes of a run meet: unix sockets in a private directory, or loopback ports.
+"""Where the processes of a run meet: unix sockets in a private directory, or ports, loopback's unless a
+hosts file names other addresses.
 
 First step of a start: the endpoints are chosen and checked here, before any process exists, so that
 a taken port or directory is one clear message.
@@ -18,6 +19,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from supervise.hosts import LOWEST_PORT, Host, Hosts
 from wire.child import remove_sockets
 from wire.errors import UsageError
 
@@ -25,7 +27,7 @@ LONGEST_SOCKET_PATH = 107
 """Bytes of a unix socket's path on Linux, without the closing zero."""
 HIGHEST_FREE_PORT = 32_768
 """From here on the kernel hands ports to outgoing connections."""
-LOWEST_PORT = 1024
+LOOPBACK = "127.0.0.1"
 PREFIX = "octarm-"
 STALE_AFTER_S = 60.0
 SPECIAL = "?#;,"
@@ -159,32 +161,41 @@ def _given_directory(nodes: int, directory: Path) -> Endpoints:
     return Endpoints(plant, own, _lock=lock, _created=directory if created else None)
 
 
-# -- loopback ports -----------------------------------------------------------------------------
+# -- ports --------------------------------------------------------------------------------------
 
 
-def port_taken(port: int) -> str | None:
-    """Why this process cannot listen on a loopback port, None if it can."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
+def port_taken(port: int, address: str = LOOPBACK) -> str | None:
+    """Why this process cannot listen on a port of an address (0: on any), None if it can."""
+    try:
+        family, kind, _, _, target = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(target)
             probe.listen(1)
-        except OSError as error:
-            return error.strerror or str(error)
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
+
+
+def _free_base(count: int, address: str = LOOPBACK) -> int | None:
+    """The first of so many free ports in a row, None if none were found."""
+    for _ in range(100):
+        base = random.randrange(10_000, HIGHEST_FREE_PORT - count)
+        if not any(port_taken(port, address) for port in range(base, base + count)):
+            return base
     return None
 
 
 def _tcp(nodes: int, base_port: int | None) -> Endpoints:
     count = nodes  # the plant and nodes 0 .. n - 2
     if base_port is None:
-        for _ in range(100):
-            base = random.randrange(10_000, HIGHEST_FREE_PORT - count)
-            if not any(port_taken(port) for port in range(base, base + count)):
-                return _ports(base, nodes)
-        raise UsageError(
-            f"--transport tcp: no {count} free loopback ports in a row below "
-            f"{HIGHEST_FREE_PORT}; give --base-port or use --transport unix"
-        )
+        base = _free_base(count)
+        if base is None:
+            raise UsageError(
+                f"--transport tcp: no {count} free loopback ports in a row below "
+                f"{HIGHEST_FREE_PORT}; give --base-port or use --transport unix"
+            )
+        return _ports(base, nodes)
     if not LOWEST_PORT <= base_port <= 65_536 - count:
         raise UsageError(
             f"--base-port {base_port}: expected {LOWEST_PORT}..{65_536 - count} for {nodes} nodes"
@@ -200,5 +211,70 @@ def _tcp(nodes: int, base_port: int | None) -> Endpoints:
 
 def _ports(base: int, nodes: int) -> Endpoints:
     return Endpoints(
-        f"tcp/127.0.0.1:{base}", [f"tcp/127.0.0.1:{base + 1 + i}" for i in range(nodes - 1)]
+        _endpoint(LOOPBACK, base), [_endpoint(LOOPBACK, base + 1 + i) for i in range(nodes - 1)]
     )
+
+
+def _endpoint(address: str, port: int) -> str:
+    return f"tcp/[{address}]:{port}" if ":" in address else f"tcp/{address}:{port}"
+
+
+# -- hosts --------------------------------------------------------------------------------------
+
+
+def over_hosts(hosts: Hosts) -> Endpoints:
+    """The endpoints of a run over several hosts; UsageError names the key of what cannot be used.
+
+    Only this machine's ports can be tried here; a node elsewhere says itself that it cannot listen.
+    """
+    last = hosts.hosts[-1].indices[-1]  # the tip has no right neighbour to listen for
+    plant = _own_base(hosts, "plant", hosts.plant_address, hosts.plant_port, 1)
+    used = {_endpoint(hosts.plant_address, plant): "the plant"}
+    for host in hosts.hosts:
+        base = _host_base(hosts, host, min(host.nodes, last - host.first), used)
+        for offset, index in enumerate(host.indices[: last - host.first]):
+            endpoint = _endpoint(host.address, base + offset)
+            if endpoint in used:
+                raise UsageError(
+                    f"hosts file {hosts.path}: node {index} of host {host.name} and {used[endpoint]} "
+                    f"would both listen on {endpoint}; give the host another base_port"
+                )
+            used[endpoint] = f"node {index}"
+    own, *nodes = used
+    return Endpoints(own, nodes)
+
+
+def _host_base(hosts: Hosts, host: Host, count: int, used: dict[str, str]) -> int:
+    if not host.local:
+        assert host.base_port is not None  # set when the file was read
+        return host.base_port
+    where = f"host {host.name}"
+    while True:
+        base = _own_base(hosts, where, host.address, host.base_port, count)
+        taken = {_endpoint(host.address, base + offset) for offset in range(count)}
+        if host.base_port is not None or not taken & used.keys():
+            return base
+
+
+def _own_base(hosts: Hosts, where: str, address: str, base: int | None, count: int) -> int:
+    """The first of `count` ports of an address of this machine, checked."""
+    if reason := port_taken(0, address):
+        raise UsageError(
+            f"hosts file {hosts.path}: {where}: nothing can listen on {address} here ({reason}); give "
+            "an address of this machine"
+        )
+    if base is None:
+        base = _free_base(count, address)
+        if base is None:
+            raise UsageError(
+                f"hosts file {hosts.path}: {where}: no {count} free ports in a row on {address} below "
+                f"{HIGHEST_FREE_PORT}; free some, or give the first one in the file"
+            )
+        return base
+    for port in range(base, base + count):
+        if reason := port_taken(port, address):
+            raise UsageError(
+                f"hosts file {hosts.path}: {where}: port {port} of {address} cannot be used ({reason}); "
+                "give another one, or leave it out"
+            )
+    return base

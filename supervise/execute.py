@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from supervise.conductor import Conductor, Interrupted, log_of
-from supervise.endpoints import choose
+from supervise.endpoints import Endpoints, choose, over_hosts
 from supervise.options import RunOptions
 from supervise.plan import Plan, make_plan, new_run_id, prepare
 from supervise.state import Outcome
@@ -39,7 +39,7 @@ def execute(options: RunOptions, *, quiet: bool, plot: bool) -> Result:
     """Run the arm once. Raises OctarmError if it did not come to the first tick."""
     prepared = prepare(options)
     run_id = new_run_id()
-    endpoints = choose(options.nodes, options.transport, options.base_port, options.socket_dir)
+    endpoints = _meet(options)
     try:
         directory, made = _make_directory(options.out, run_id)
         with choose_view(prepared.course.ticks, quiet=quiet) as view:
@@ -56,6 +56,12 @@ def execute(options: RunOptions, *, quiet: bool, plot: bool) -> Result:
     finally:
         endpoints.close()
     return result
+
+
+def _meet(options: RunOptions) -> Endpoints:
+    if options.placed_on is not None:
+        return over_hosts(options.placed_on)
+    return choose(options.nodes, options.transport, options.base_port, options.socket_dir)
 
 
 def _conduct(plan: Plan, view: View) -> Outcome:

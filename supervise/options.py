@@ -10,9 +10,13 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from supervise.shipped import DEFAULT_GAINS
 from wire.errors import UsageError
+
+if TYPE_CHECKING:
+    from supervise.hosts import Hosts
 
 MOST_NODES = 1000
 MOST_TICKS = 10_000_000
@@ -52,6 +56,7 @@ class RunOptions:
     period_s: float | None = None
     """None: the tick, that is one second of the arm's in one of the clock's."""
     hold_ticks: int = 2
+    hosts: Path | None = None
 
     def __post_init__(self) -> None:
         from plant.disturbance import DisturbanceSpec
@@ -93,6 +98,12 @@ class RunOptions:
         SensorNoise(self.seed, self.noise_velocity or 0.0, self.noise_curvature or 0.0)
         plant_cells(self.nodes, self.plant_cells)
         _ = self.placed
+        if self.placed_on is not None:
+            for name, value in (("--base-port", self.base_port), ("--socket-dir", self.socket_dir)):
+                if value is not None:
+                    raise UsageError(
+                        f"{name}: with --hosts the hosts file says where processes meet; leave it out"
+                    )
 
     @cached_property
     def placed(self) -> str | tuple[float, ...]:
@@ -100,6 +111,15 @@ class RunOptions:
         from supervise.spacing import parse_spacing
 
         return parse_spacing(self.spacing, self.nodes)
+
+    @cached_property
+    def placed_on(self) -> Hosts | None:
+        """The hosts of --hosts, None for this machine alone; the file is read once."""
+        if self.hosts is None:
+            return None
+        from supervise.hosts import read_hosts
+
+        return read_hosts(self.hosts, self.nodes)
 
 
 def _at_least(name: str, value: int, least: int, why: str) -> None:

@@ -23,6 +23,7 @@ from deploy import Deployment, SegmentGrid, deploy
 from deploy.path import References, make_references
 from supervise.endpoints import Endpoints
 from supervise.factors_file import factors_json
+from supervise.hosts import Host, this_machine
 from supervise.options import RunOptions
 from supervise.scenario import Course, settle
 from supervise.spacing import spacing_name
@@ -60,8 +61,14 @@ class Plan:
     endpoints: Endpoints
     directory: Path
     """Where the recording and everything else about the run goes."""
+    hosts: tuple[Host, ...]
+    """In the order of their segments; one, this machine, without a hosts file."""
     by_hand: frozenset[int]
     start_timeout_s: float
+
+    def host_of(self, node: int) -> Host:
+        """The host that a node runs on."""
+        return next(host for host in self.hosts if node in host.indices)
 
 
 def new_run_id() -> str:
@@ -162,15 +169,19 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
     )
     epoch_ns = time.monotonic_ns()
     cores = _cores(nodes) if options.pin else [None] * nodes
+    placed = options.placed_on
+    hosts = (this_machine(nodes),) if placed is None else placed.hosts
+    # Of another machine neither clock nor cores are known.
+    elsewhere = {i for host in hosts if host.own_clock for i in host.indices}
 
-    def links(listen: list[str], connect: list[str], cpu: int | None = None) -> LinkConfig:
+    def links(listen: list[str], connect: list[str], node: int | None = None) -> LinkConfig:
         return LinkConfig(
             listen=tuple(listen),
             connect=tuple(connect),
             directory=endpoints.private,
             deadline_s=options.deadline_s,
-            epoch_ns=epoch_ns,
-            cpu=cpu,
+            epoch_ns=None if node in elsewhere else epoch_ns,
+            cpu=None if node is None or node in elsewhere else cores[node],
             fifo=FIFO_PRIORITY if options.fifo else None,
         )
 
@@ -186,7 +197,7 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             scheduling=run.scheduling,
             batch_ticks=BATCH_TICKS,
             skip_ticks=0 if run.pace is None else run.pace.hold_ticks + 1,
-            links=links(listen, connect, cores[i]),
+            links=links(listen, connect, i),
             segments=tuple(
                 SegmentConfig(deployment.nodes[j].to_plain(), references.nodes[j].to_plain())
                 for j in own
@@ -214,7 +225,7 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             forward_widths=tuple(f.forward_received for f in deployment.nodes),
             backward_widths=tuple(f.backward_received for f in deployment.nodes),
             flush_s=FLUSH_S,
-            metadata=_metadata(run, epoch_ns),
+            metadata=_metadata(run, epoch_ns, () if placed is None else hosts),
             attachments={
                 "gains.json": options.gains.read_text(),
                 "run.json": dumps(run),
@@ -224,7 +235,8 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         ),
         endpoints=endpoints,
         directory=directory,
-        by_hand=frozenset(options.by_hand),
+        hosts=hosts,
+        by_hand=frozenset(options.by_hand).union(*(h.indices for h in hosts if h.by_hand)),
         start_timeout_s=options.start_timeout_s,
     )
 
@@ -245,11 +257,15 @@ def _cores(nodes: int) -> list[int | None]:
     return [pair[i * len(pair) // nodes] for i in range(nodes)]
 
 
-def _metadata(run: RunConfig, epoch_ns: int) -> dict[str, str]:
+def _metadata(run: RunConfig, epoch_ns: int, hosts: tuple[Host, ...]) -> dict[str, str]:
     """The record "octarm": what the recording must say about where it came from."""
     packages = ("octarm", "numpy", "eclipse-zenoh", "msgpack", "mcap", "msgspec")
     versions = {name: _version(name) for name in packages}
     versions["python"] = platform.python_version()
+    places = [
+        {"name": h.name, "address": h.address, "nodes": h.nodes, "own_clock": h.own_clock}
+        for h in hosts
+    ]
     return {
         "format_version": str(FORMAT_VERSION),
         "run_id": run.run_id,
@@ -260,7 +276,7 @@ def _metadata(run: RunConfig, epoch_ns: int) -> dict[str, str]:
         "epoch_ns": str(epoch_ns),
         "started_at": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "machine": platform.machine(),
-    }
+    } | ({"hosts": json.dumps(places)} if hosts else {})
 
 
 def _version(name: str) -> str:

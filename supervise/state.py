@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any
 
-from supervise.children import Handle
+from supervise.children import FarNode, Handle
 from supervise.plan import Plan
 from wire.errors import ExitCode
 
@@ -35,8 +35,8 @@ class RunState:
     """Everything known about the processes of one run; names are "plant", "recorder", "node 3"."""
 
     plan: Plan
-    nodes: dict[int, Handle] = field(default_factory=dict)
-    """Processes of the nodes that were forked here."""
+    nodes: dict[int, Handle | FarNode] = field(default_factory=dict)
+    """Processes of the nodes that were forked here, or by a zygote on another host."""
     linked: set[int] = field(default_factory=set)
     ready: set[str] = field(default_factory=set)
     waiting: dict[str, list[str]] = field(default_factory=dict)
@@ -103,15 +103,21 @@ class RunState:
 
     def who_is_missing(self) -> str:
         """Which processes and links are not there, for the start-up's time limit."""
-        parts: list[str] = []
+        started = [f"host {host.name}" for host in self.plan.hosts if host.start]
+        parts = [f"{name} does not answer" for name in started if name not in self.waiting]
         for i in self.plan.run.firsts:
-            name = f"node {i}"
-            if i in self.linked or name in self.ready:
+            name, host = f"node {i}", self.plan.host_of(i)
+            if (
+                i in self.linked
+                or name in self.ready
+                or f"host {host.name} does not answer" in parts
+            ):
                 continue
             if self.waiting.get(name):
                 parts.append(f"{name} waits for {', '.join(self.waiting[name])}")
             elif i in self.plan.by_hand:
-                parts.append(f"{name} was not started (it is yours: --by-hand)")
+                why = f'host {host.name} has start = "print"' if host.by_hand else "--by-hand"
+                parts.append(f"{name} was not started (it is yours: {why})")
             else:
                 parts.append(f"{name} does not answer")
         for name in ("plant", "recorder"):

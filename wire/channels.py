@@ -5,7 +5,7 @@ Messages are flat JSON objects with a JSON Schema, so that Foxglove, PlotJuggler
 them. Every message begins with `tick` and `time_s` = tick * period; the log time is the same in
 nanoseconds. All instants and durations of the wall clock are in channels whose last part is
 `timing`; they are nanoseconds since the `epoch_ns` of the metadata, on the monotonic clock that the
-processes of a machine share.
+processes of a machine share; a node on another machine counts from its own first measurement.
 """
 
 from __future__ import annotations

@@ -90,7 +90,8 @@ class Child:
     def watch(self, *, reads_control: bool) -> None:
         """Watch the lifeline without touching the process's signals."""
         if self._control >= 0:
-            self._poll.register(self._control, select.POLLIN if reads_control else 0)
+            # A lifeline that is a socket (sshd's) ends half first: only POLLRDHUP tells who never reads.
+            self._poll.register(self._control, select.POLLIN if reads_control else select.POLLRDHUP)
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         self.stopping = True
@@ -128,7 +129,7 @@ class Child:
                     os.read(self._read, 4096)
             elif event & select.POLLIN:
                 out += self._control_lines()
-            elif event & (select.POLLHUP | select.POLLERR | select.POLLNVAL):
+            elif event & (select.POLLHUP | select.POLLRDHUP | select.POLLERR | select.POLLNVAL):
                 self._lost()
         return out
 

@@ -187,8 +187,9 @@ class LinkConfig:
     """The run's private directory of sockets, None over TCP or when the user owns it."""
     deadline_s: float
     """Longest wait within a tick before the arm is stopped."""
-    epoch_ns: int
-    """Zero of the recorded wall-clock instants, on the monotonic clock that all processes share."""
+    epoch_ns: int | None
+    """Zero of the recorded wall-clock instants, on the monotonic clock of the launcher's machine. None
+    for a node on another machine, whose clock is its own: it takes its first measurement's instant."""
     cpu: int | None
     """The core to run on, None to leave it to the scheduler."""
     fifo: int | None

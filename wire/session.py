@@ -11,11 +11,15 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import re
+import socket
 from collections.abc import Callable, Sequence
 from threading import get_ident
 from typing import Any
 
 import zenoh
+
+from wire.errors import OctarmError
 
 RUNTIME_NODE = (
     "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),"
@@ -98,11 +102,25 @@ def open_session(mode: str, listen: Sequence[str], connect: Sequence[str]) -> An
     (recorder).
 
     Sets ZENOH_RUNTIME, which the library reads once a process, so it must be the first call into
-    it.
+    it. Raises OctarmError if this host does not let it listen there.
     """
     os.environ["ZENOH_RUNTIME"] = RUNTIME_PLANT if mode == "router" else RUNTIME_NODE
     text = json.dumps(_config(mode, listen, connect))
-    return zenoh.open(zenoh.Config.from_json5(text))
+    try:
+        return zenoh.open(zenoh.Config.from_json5(text))
+    except zenoh.ZError as error:
+        if not listen:
+            raise
+        raise OctarmError(
+            f"cannot listen on {', '.join(listen)} of {socket.gethostname()}: {_reason(str(error))}; "
+            "free the port or choose another, and check that the address is this host's"
+        ) from None
+
+
+def _reason(text: str) -> str:
+    """The system's words in an error of Zenoh, which also names places in its source."""
+    found = re.search(r"([A-Z][\w ,'-]*) \(os error", text)
+    return found[1] if found else text.partition(" at /")[0]
 
 
 def open_client(connect: Sequence[str], give_up: Callable[[], bool]) -> Any | None:

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,20 +28,30 @@ PATIENCE_S = 60.0
 class Cli:
     """One `octarm` process. Everything it starts carries a mark in its environment."""
 
-    def __init__(self, work: Path, arguments: list[str]) -> None:
-        """`arguments` follow the interpreter's name."""
+    def __init__(
+        self,
+        work: Path,
+        arguments: list[str],
+        within: Sequence[str] = (),
+        stdin: Path | None = None,
+    ) -> None:
+        """`arguments` follow the interpreter's name, `within` are words before it."""
         self.mark = secrets.token_hex(8)
         self.work = work
         self.sockets = Path(tempfile.mkdtemp(prefix="ot-"))
         environment = {**os.environ, MARK: self.mark, "TMPDIR": str(self.sockets)}
         environment.pop("COLUMNS", None)
+        source = subprocess.DEVNULL if stdin is None else stdin.open("rb")
         self.popen = subprocess.Popen(
-            [sys.executable, *arguments],
+            [*within, sys.executable, *arguments],
             cwd=work,
             env=environment,
+            stdin=source,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )
+        if not isinstance(source, int):
+            source.close()
         self.out = ""
         self.err = ""
 
@@ -141,22 +151,22 @@ class Start:
         self.gains = gains
         self.started: list[Cli] = []
 
-    def __call__(self, *arguments: str | Path) -> Cli:
+    def __call__(self, *arguments: str | Path, within: Sequence[str] = ()) -> Cli:
         work = self.work / f"run{len(self.started)}"
         work.mkdir()
-        cli = Cli(work, [str(ROOT / "launcher.py"), *map(str, arguments)])
+        cli = Cli(work, [str(ROOT / "launcher.py"), *map(str, arguments)], within)
         self.started.append(cli)
         return cli
 
-    def node(self, configuration: str) -> Cli:
+    def node(self, configuration: str, stdin: Path | None = None) -> Cli:
         """`python -m node`, as a user would type it."""
-        cli = Cli(ROOT, ["-m", "node", configuration])
+        cli = Cli(ROOT, ["-m", "node", configuration], stdin=stdin)
         self.started.append(cli)
         return cli
 
-    def run(self, *arguments: str | Path) -> Cli:
-        """`octarm run` with the test's gains."""
-        return self("run", "--gains", self.gains, *arguments)
+    def run(self, *arguments: str | Path, within: Sequence[str] = ()) -> Cli:
+        """`octarm run` with the test's gains, `within` a network namespace for example."""
+        return self("run", "--gains", self.gains, *arguments, within=within)
 
 
 @pytest.fixture(scope="session")

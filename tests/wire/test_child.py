@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -65,6 +66,21 @@ def test_the_end_of_the_lifeline_is_noticed(pipes: Pipes, tmp_path: Path) -> Non
     pipes.child.leave([])
     assert not tmp_path.exists()
     assert 0 < signal.alarm(0) <= ORPHAN_S
+
+
+def test_the_end_of_a_lifeline_that_is_a_socket_is_noticed_by_who_never_reads() -> None:
+    """As behind sshd, whose socket carries both ways: only one of them ends."""
+    near, far = socket.socketpair()
+    with near, far:
+        child = Child("node 1", control=near.fileno(), status=-1, directory=None)
+        child.watch(reads_control=False)
+        assert child.wait(0.0) == []
+        assert not child.orphaned
+        far.shutdown(socket.SHUT_WR)
+        assert child.wait(1.0) == []
+        assert child.orphaned
+        child.close()
+    signal.alarm(0)
 
 
 def test_a_wake_up_from_another_thread_ends_the_wait(pipes: Pipes) -> None:
