@@ -212,7 +212,7 @@ def _realtime(recording: Recording) -> dict[str, Any] | None:
     return {
         "period_s": pace.period_s,
         "hold_ticks": pace.hold_ticks,
-        "late_ticks": int(np.count_nonzero(recording.late)),
+        "late_ticks": recording.counter("late_ticks") or int(np.count_nonzero(recording.late)),
         "longest_hold_ticks": int(np.max(edges[1::2] - edges[::2], initial=0)),
     }
 

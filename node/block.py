@@ -53,7 +53,7 @@ class Outlet(Protocol):
         """`commands` is complete; it belongs to the tick after this one and its setpoint."""
 
     def recorded(self, tick: int, rows: Sequence[Array]) -> None:
-        """Rows (ticks, columns) of each segment from this tick on; left alone until the next batch but one."""
+        """Rows (ticks, columns) of each segment from this tick on, to keep."""
 
     def begins(self, tick: int, setpoint: int) -> None:
         """The tick whose messages are expected now, and its setpoint."""
@@ -67,8 +67,9 @@ class SegmentBlock:
     """Consecutive segments within their tick. Not thread-safe: the process around it holds a lock.
 
     A segment's row is y (2), xh (4), u, setpoint, bump, c, d, then the instants on the monotonic clock, in
-    ns after `epoch_ns` (None: after the first measurement), at which the measurement, c (unless it is the root's), d (unless the tip's) came and
-    the command left. `batch` rows are handed over at once, the first time `first_batch`.
+    ns after `epoch_ns` (None: after the first measurement), at which the measurement, c (unless it is the
+    root's), d (unless the tip's) came and the command left. `batch` rows are handed over at once, the first
+    time `first_batch`.
     """
 
     def __init__(
@@ -101,14 +102,14 @@ class SegmentBlock:
         self._inner = tuple(pairwise(sweeps))
         self._backward_inner = tuple((b, a) for a, b in reversed(self._inner))
         self._setpoints = frozenset(map(float, range(sweeps[0].setpoints)))
-        self._blocks = tuple(tuple(_rows(sweep, batch) for sweep in sweeps) for _ in range(2))
+        self._rows = tuple(_rows(sweep, batch) for sweep in sweeps)
         self._batch, self._quota = batch, first_batch or batch
         self._total_forward = np.ones(outlet.forward.size).dot
         self._total_backward = np.ones(outlet.backward.size).dot
-        self._half = self._filled = 0
+        self._filled = 0
         self._batch_began_ns = 0
-        for sweep, rows in zip(sweeps, self._blocks[0], strict=True):
-            sweep.start_in(rows.rows[0])
+        for sweep, block in zip(sweeps, self._rows, strict=True):
+            sweep.start_in(block.rows[0])
         self._clear()
         outlet.begins(0, self.setpoint)
 
@@ -197,7 +198,7 @@ class SegmentBlock:
     def skip_to(self, tick: int) -> None:
         """Nothing of this tick will come, the next is `tick`: the ticks between had no sweep."""
         self._hand_over(self.tick)
-        for sweep, block in zip(self._sweeps, self._blocks[self._half], strict=True):
+        for sweep, block in zip(self._sweeps, self._rows, strict=True):
             sweep.start_in(block.rows[0])
             sweep.skip_to(tick)
         self.tick = tick
@@ -254,9 +255,9 @@ class SegmentBlock:
         self._filled += 1
         if self._filled >= self._quota or sent_ns - self._batch_began_ns > BATCH_NS:
             self._hand_over(self.tick)
-        block, at = self._blocks[self._half], self._filled
-        for i, sweep in enumerate(sweeps):
-            sweep.accept(sweep.last_output, block[i].rows[at])
+        at = self._filled
+        for sweep, block in zip(sweeps, self._rows, strict=True):
+            sweep.accept(sweep.last_output, block.rows[at])
         outlet.begins(self.tick, self._root.setpoint)
 
     def flush(self) -> None:
@@ -265,11 +266,11 @@ class SegmentBlock:
             self.skip_to(self.tick)
 
     def _hand_over(self, next_tick: int) -> None:
-        """Give the filled rows to the recorder, in batches, and go on in the other half."""
+        """Give a copy of the filled rows away, and fill them anew."""
         if self._filled:
-            rows = [block.array[: self._filled] for block in self._blocks[self._half]]
+            rows = [block.array[: self._filled].copy() for block in self._rows]
             self._outlet.recorded(next_tick - self._filled, rows)
-            self._half, self._filled, self._quota = 1 - self._half, 0, self._batch
+            self._filled, self._quota = 0, self._batch
 
     # -- what is wrong ----------------------------------------------------------------------------
 

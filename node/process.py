@@ -250,7 +250,7 @@ class NodeProcess:
 
     def _send_batches(self) -> None:
         """What could wait: records to the recorder, and the sums over what was sent and received."""
-        for flow in (*self._received.values(), *self._sent.values()):
+        for flow in (*self._received.values(), *self._sent.values(), self._telemetry):
             flow.settle()
         while self._batches:
             tick, segments = self._batches.popleft()
@@ -285,15 +285,16 @@ class NodeProcess:
         """A message that is not the one that is due: refused by name, unless a tick was left out."""
         message, block = incoming.decode(raw), self._block
         ahead = message.tick - block.tick
-        if 0 < ahead <= self._config.skip_ticks and not block.begun:
-            block.skip_to(message.tick)
-        elif ahead:
+        skips = 0 < ahead <= self._config.skip_ticks and not block.begun
+        if ahead and not skips:
             reason = Reason.STALE if ahead < 0 else Reason.EARLY
             raise RejectedError(reason, f"expected tick {block.tick}, got {message.tick}")
         if message.setpoint != block.setpoint:
             raise RejectedError(
                 Reason.SETPOINT, f"expected {block.setpoint}, got {message.setpoint}"
             )
+        if skips:
+            block.skip_to(message.tick)
         return message.values
 
     def _fail(self, code: str, text: str) -> None:

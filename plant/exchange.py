@@ -140,8 +140,14 @@ class Exchange:
         np.copyto(self.commands, self._coming)
         return None
 
+    def settle(self) -> None:
+        """Make the sums over what was sent and received, between two ticks."""
+        for flow in (self._sent, *self._received):
+            flow.settle()
+
     def counters(self) -> dict[str, int]:
         """What was sent, received and refused."""
+        self.settle()
         return (
             {
                 "command_received_messages": sum(flow.messages for flow in self._received),
@@ -164,11 +170,11 @@ class Exchange:
                     self._coming[own] = values
                     _check_finite(self._coming[own])
                     self._have[place] = True
-                    self.left -= 1
-                    done = not self.left
+                    flow.add(raw)
+                    done = self.left == 1
                     if done:
                         self.complete_ns = monotonic_ns()
-                flow.add(raw)
+                    self.left -= 1
             except RejectedError as error:
                 self._rejections.add(error.reason)
                 return

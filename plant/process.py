@@ -213,8 +213,7 @@ class PlantProcess:
                 swept = False
             else:
                 began_ns = pace.due_ns(k)
-                self._record.mark_late(state)
-                self._late_ticks += 1
+                self._mark_late(state)
                 if not pace.late():
                     return self._safe(pace, k, state)
             held = exchange.commands.copy()
@@ -232,7 +231,8 @@ class PlantProcess:
             self._add(k, state, (pace.due_ns(k), began_ns, duration_ns, advance_ns))
             state = following
         # The last sweep may be late as well; it is let through, so that what was sent is also received.
-        return self._wait(exchange.tick) or self._all_done()
+        stop = self._wait(exchange.tick)
+        return self._all_done() if stop is None else stop._replace(tick=self._done)
 
     def _safe(self, pace: Pace, k: int, state: Array) -> Stop:
         """Stop the nodes and let the arm rest under the loads that hold the setpoint, for some ticks."""
@@ -250,7 +250,7 @@ class PlantProcess:
             advance_ns = self._advance(rest, j)
             self._add(j, state, (pace.due_ns(j), pace.due_ns(j), 0, advance_ns))
             state = self._record.state(j + 1)
-            self._record.mark_late(state)
+            self._mark_late(state)
             if self._until(pace.due_ns(j + 1)) or not np.isfinite(state).all():
                 break
         return stop
@@ -262,12 +262,16 @@ class PlantProcess:
             self._hear(self._child.wait_precisely(left_ns))
             if self._orders or self._child.stopping:
                 break
-        return self._interrupted(exchange.tick + 1)
+        return self._interrupted(self._done)
 
     # -- parts of a tick --------------------------------------------------------------------------
 
     def _measure(self, k: int) -> Array:
         return self._plant.measure() + self._noise.sample(k, self._n)
+
+    def _mark_late(self, state: Array) -> None:
+        self._late_ticks += 1
+        self._record.mark_late(state)
 
     def _advance(self, held: Array, k: int) -> int:
         """Let the arm move; how long the emulation took, ns."""
@@ -283,6 +287,7 @@ class PlantProcess:
         self._done = k + 1
         if began_ns - self._told_ns > PROGRESS_NS:
             self._told_ns = began_ns
+            self._exchange.settle()
             self._child.status("progress", tick=k + 1)
 
     def _broken(self, k: int, measured: Array, state: Array) -> Stop | None:

@@ -78,6 +78,7 @@ class PlantRecord:
             raw = encode_batch(self._run, next_tick - self._filled, PLANT, rows)
             self._publisher.put(raw)
             self.flow.add(raw)
+            self.flow.settle()
             self._filled = 0
 
 

@@ -147,6 +147,7 @@ class RecorderProcess:
                 self._rejections.add(error.reason)
             if monotonic() - began > 0.1:
                 break  # look at the launcher's messages in between
+        self._received.settle()
         self._write(self._merge.complete())
         self._writer.flush_if_due()
         self._progress()
@@ -232,10 +233,12 @@ class RecorderProcess:
         self._write(self._merge.rest())
         run = self._config.run
         for gap in self._merge.gaps:
-            if not self._lost(gap):
+            if not (lost := self._lost(gap)):
                 continue
             who = "plant" if gap.sender == PLANT else f"node {gap.sender}"
             text = f"telemetry of {who}: ticks {gap.first} to {gap.after - 1} were lost"
+            if late := gap.after - gap.first - lost:
+                text += f", but for {late} that were late"
             self._writer.event(gap.first, "warning", "telemetry_lost", text)
         self._tell(math.inf)
         totals = self._totals()

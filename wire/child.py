@@ -112,7 +112,9 @@ class Child:
         """The same as `wait` with a time that is not rounded up to milliseconds."""
         *lines, self._buffer = self._buffer.split(b"\n")
         if not lines:
-            watched = [self._read] if self.orphaned else [self._read, max(0, self._control)]
+            watched = [self._read]
+            if self._control >= 0 and not self.orphaned:
+                watched.append(self._control)
             if select.select(watched, (), (), max(0, nanoseconds) * 1e-9)[0]:
                 lines = self.wait_lines(0.0)
         return [json.loads(line) for line in lines]
