@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import gc
 import math
-import os
 import traceback
 from collections.abc import Callable
 from threading import Lock
@@ -42,6 +41,7 @@ from wire.messages import (
     encode_numbers,
     run_tag,
 )
+from wire.placement import place
 from wire.reference import Reference
 from wire.run_config import NodeConfig
 
@@ -108,11 +108,7 @@ class NodeProcess:
     def run(self) -> ExitCode:
         """Link up, take part in every tick, report, and leave; returns the exit code."""
         config = self._config
-        if config.links.cpu is not None:
-            try:
-                os.sched_setaffinity(0, {config.links.cpu})
-            except OSError as error:  # a container may have taken the core away since
-                self._child.status("note", text=f"not pinned to core {config.links.cpu}: {error}")
+        place(config.links.cpu, config.links.fifo, lambda t: self._child.status("note", text=t))
         session = zsession.open_session("peer", config.links.listen, config.links.connect)
         try:
             self._declare(session)

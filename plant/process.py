@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import gc
 import math
-import os
 import traceback
 from collections.abc import Callable
 from threading import Lock
@@ -43,6 +42,7 @@ from wire.messages import (
     encode_stop,
     run_tag,
 )
+from wire.placement import place
 from wire.reference import Reference
 from wire.run_config import PlantConfig
 
@@ -100,8 +100,7 @@ class PlantProcess:
         """Link up, wait for the launcher's start, run all ticks, end in order; returns the exit
         code."""
         links = self._config.links
-        if links.cpu is not None:
-            os.sched_setaffinity(0, {links.cpu})
+        place(links.cpu, links.fifo, lambda text: self._child.status("note", text=text))
         session = zsession.open_session("router", links.listen, links.connect)
         try:
             self._declare(session)

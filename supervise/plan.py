@@ -166,6 +166,7 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             deadline_s=options.deadline_s,
             epoch_ns=epoch_ns,
             cpu=cpu,
+            fifo=None,
         )
 
     def node(i: int) -> NodeConfig:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from wire.errors import UsageError
 from wire.run_config import LegConfig, LinkConfig, NodeConfig, SchedulingConfig, dumps, loads
 
-LINKS = LinkConfig(("a",), ("b", "c"), None, 2.5, 10**18, 1)
+LINKS = LinkConfig(("a",), ("b", "c"), None, 2.5, 10**18, 1, 10)
 
 
 def node(**changes: Any) -> NodeConfig:
@@ -38,7 +38,7 @@ def test_round_trip_with_bytes() -> None:
 
 @given(st.floats(min_value=1e-300, max_value=1e300))
 def test_numbers_come_back_exactly(value: float) -> None:
-    links = LinkConfig((), (), None, value, 0, None)
+    links = LinkConfig((), (), None, value, 0, None, None)
     assert loads(LinkConfig, dumps(links), "here").deadline_s == value
 
 
