@@ -148,6 +148,11 @@ def queue(capacity: int) -> Any:
     return zenoh.handlers.FifoChannel(capacity)
 
 
+def newest(capacity: int) -> Any:
+    """The same, but only so many: the oldest makes room."""
+    return zenoh.handlers.RingChannel(capacity)
+
+
 def control_publisher(session: Any, key: str) -> Any:
     """A publisher for the control path: first in every queue, never dropped."""
     return session.declare_publisher(
