@@ -34,6 +34,7 @@ def main() -> int:
 def _drive(parent: int, directory: str | None) -> int:
     from bench.configs import DriverConfig
     from bench.driver import Driver
+    from bench.zygote import leave
 
     die_with_parent(parent)
     name_process("octarm-driver")
@@ -52,7 +53,7 @@ def _drive(parent: int, directory: str | None) -> int:
         child.status("failed", code="internal", message=f"driver: {error!r}")
         return int(ExitCode.INTERNAL)
     finally:
-        child.leave(endpoints)
+        leave(child, endpoints)
 
 
 if __name__ == "__main__":

@@ -91,6 +91,8 @@ class Campaign:
                 if not one.crowd:
                     living[pattern] = stack.enter_context(self._group(pattern, one.real))
             order = list(series)
+            nodes = next(iter(series.values())).real.processes
+            self._progress(f"{nodes} nodes: bursts of {', '.join(order)} in turn")
             for repetition in range(self._options.repetitions):
                 for pattern in order:
                     one = series[pattern]
@@ -102,7 +104,7 @@ class Campaign:
                         self._burst(one, living[pattern])
                 order.append(order.pop(0))
                 self._progress(
-                    f"{one.real.processes} nodes: repetition {repetition + 1} of "
+                    f"{nodes} nodes: repetition {repetition + 1} of "
                     f"{self._options.repetitions}, sweep p50 in us: "
                     + ", ".join(f"{p} {s.last_us:.0f}" for p, s in series.items())
                 )

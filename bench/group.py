@@ -32,6 +32,8 @@ from wire.run_config import dumps
 START_S = 60.0
 WARM_TICKS = 50
 WARM_S = 3.0
+PACED_WARM_TICKS = 10
+"""Fewer: at a low rate each takes a long period."""
 GRACE_S = 6.0
 """A zygote ends its own children first, which takes up to two seconds."""
 ANSWER_S = 30.0
@@ -214,14 +216,15 @@ class Group:
         """
         pids = self._pids()
         before = cpu_ns(pids)
-        patience = (ticks + WARM_TICKS) * period_ns * 2e-9 if period_ns else limit_s + WARM_S
+        warm = PACED_WARM_TICKS if period_ns else WARM_TICKS
+        patience = (ticks + warm) * period_ns * 2e-9 if period_ns else limit_s + WARM_S
         self._order(
             do="burst",
             ticks=ticks,
             limit_s=limit_s,
             period_ns=period_ns,
             most_late=most_late,
-            warm=WARM_TICKS,
+            warm=warm,
             warm_s=WARM_S,
         )
         all_ticks = self._await("ran", Deadline(patience + ANSWER_S))["ticks"]
