@@ -16,7 +16,8 @@ import numpy as np
 
 from bench.configs import DriverConfig
 from bench.pacing import TickLostError, lock_step, paced
-from bench.raw import RawLinks, is_counters
+from bench.raw import RawLinks
+from bench.worker import is_counters
 from bench.zenoh_links import ZenohLinks
 from wire.child import Child
 from wire.errors import ExitCode

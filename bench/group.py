@@ -258,12 +258,11 @@ class Group:
 
     def memory(self) -> GroupMemory:
         """Of all processes now."""
-        all_of = {pid: found for pid in self._pids() if (found := memory_of(pid)) is not None}
-        own = [handle.pid for index, handle in self._workers.items() if index < self.nodes]
-        zygotes = [found for p in self._processes if (found := memory_of(p.pid)) is not None]
-        members = {*all_of} - {p.pid for p in self._processes}
-        total = sum(all_of[pid].pss_kb for pid in members) + sum(m.pss_kb for m in zygotes)
-        return GroupMemory(tuple(all_of[pid] for pid in own if pid in all_of), total)
+        found = {index: memory_of(handle.pid) for index, handle in self._workers.items()}
+        others = [memory_of(process.pid) for process in self._processes]
+        total = sum(m.pss_kb for m in (*found.values(), *others) if m is not None)
+        nodes = [m for index, m in found.items() if m is not None and index < self.nodes]
+        return GroupMemory(tuple(nodes), total)
 
     def _pids(self) -> list[int]:
         """Driver and workers."""

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from time import monotonic_ns
 
 from bench.configs import DriverConfig, WorkerConfig
-from bench.worker import Instants, Tally, counters
+from bench.worker import Instants, Tally, counters, is_counters
 from wire.child import Child, Deadline
 from wire.errors import OctarmError
 from wire.messages import encode_batch, encode_counters, run_tag
@@ -227,10 +227,3 @@ class RawLinks:
         """Close every socket."""
         for one in (self._own, *self._far):
             one.close()
-
-
-def is_counters(raw: bytes) -> bool:
-    """Whether a record is a process's last."""
-    from wire.messages import Kind, kind_of
-
-    return kind_of(raw) is Kind.COUNTERS

@@ -1,4 +1,4 @@
-"""The results as text: one table a question (sweeps, cost, rates, targets, ratios), 118 columns wide."""
+"""The results as text: one table a question (sweeps and cost, rates, targets, ratios)."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from wire import session as zsession
 from wire.child import Child
 from wire.errors import ExitCode
 from wire.keys import Keys
-from wire.messages import encode_batch, encode_counters, run_tag
+from wire.messages import Kind, encode_batch, encode_counters, kind_of, run_tag
 from wire.placement import place
 
 Handler = Callable[[bytes], None]
@@ -132,6 +132,11 @@ def counters(measurement: Tally, exchange: Tally) -> dict[str, int]:
     kinds = {"measurement": measurement, "exchange": exchange}
     messages = {f"{name}_received_messages": tally.messages for name, tally in kinds.items()}
     return messages | {f"{name}_received_bytes": tally.bytes for name, tally in kinds.items()}
+
+
+def is_counters(raw: bytes) -> bool:
+    """Whether a record is a process's last word."""
+    return kind_of(raw) is Kind.COUNTERS
 
 
 def _bare(worker: Worker) -> None:

@@ -11,8 +11,7 @@ from time import monotonic_ns, sleep
 from typing import Any
 
 from bench.configs import LEASE_MS, DriverConfig
-from bench.raw import is_counters
-from bench.worker import Tally
+from bench.worker import Tally, is_counters
 from wire import session as zsession
 from wire.child import Child, Deadline
 from wire.keys import Keys
