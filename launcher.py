@@ -376,6 +376,76 @@ def study(
     return int(ExitCode.OK)
 
 
+def bench(
+    *,
+    nodes: Ints = (),
+    pattern: Texts = (),
+    ticks: int | None = None,
+    repetitions: int | None = None,
+    seed: int | None = None,
+    sched: Literal["fifo", "other"] | None = None,
+    no_pin: Flag = False,
+    segments_per_process: int | None = None,
+    rates: bool = True,
+    rate_pattern: Texts = (),
+    rate_ticks: int | None = None,
+    quick: Flag = False,
+    compare: Path | None = None,
+    gains: Path = DEFAULT_GAINS,
+    out: Path | None = None,
+    json: Flag = False,
+    quiet: Flag = False,
+) -> int:
+    """Measure the exchange of sums between neighbours beside other exchange patterns.
+
+    Args:
+        nodes: Number of nodes; may be given several times; default 5, 10, 20, 50, 100.
+        pattern: neighbour (the nodes of a run), bare (the chain without mathematics), star, all-to-all or
+            raw (the chain over unix sockets); may be given several times; default: all.
+        ticks: In a burst; default 600.
+        repetitions: Bursts of each pattern, in turn with the others'; default 3.
+        seed: Of the noise on the measurements; default 1.
+        sched: Scheduler of all processes: fifo (real time; default) or other.
+        no_pin: Leave the nodes' cores to the scheduler.
+        segments_per_process: Segments in one process; the other patterns have as many processes; default 1.
+        rates: Look for the highest rate that is held with p99.9 below the period.
+        rate_pattern: Whose rate; may be given several times; default neighbour.
+        rate_ticks: In a trial of a rate; default 2000.
+        quick: A first look: 5 and 10 nodes, short bursts; under half a minute.
+        compare: bench.json of an earlier benchmark; prints new over old.
+        gains: Gains artefact, made by `octarm design`.
+        out: Directory for bench.json and bench.png, made if missing; default runs/bench-<date>.
+        json: Print one JSON object instead of the tables.
+        quiet: No progress.
+    """
+    from bench.execute import run_bench
+    from bench.options import choose_options
+
+    given = {
+        "gains": gains,
+        "nodes": nodes,
+        "pattern": pattern,
+        "ticks": ticks,
+        "repetitions": repetitions,
+        "seed": seed,
+        "sched": sched,
+        "pin": not no_pin,
+        "segments_per_process": segments_per_process,
+        "rates": rates,
+        "rate_pattern": rate_pattern,
+        "rate_ticks": rate_ticks,
+        "compare": compare,
+        "out": out,
+    }
+    done = run_bench(choose_options(given, quick=quick), teller(silent=quiet or json))
+    show_json(done.facts) if json else print(
+        "\n".join([done.table.rstrip(), *map(str, done.files)])
+    )
+    if done.message:
+        print(f"octarm bench: {done.message}; what was finished is kept", file=sys.stderr)
+    return int(done.exit_code)
+
+
 VERBS: dict[str, Callable[..., int]] = {
     "run": run,
     "design": design,
@@ -383,6 +453,7 @@ VERBS: dict[str, Callable[..., int]] = {
     "deploy": deploy,
     "animate": animate,
     "study": study,
+    "bench": bench,
     "doctor": doctor,
 }
 

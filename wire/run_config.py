@@ -198,6 +198,8 @@ class LinkConfig:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.deadline_s) and self.deadline_s > 0.0):
             raise UsageError(f"deadline_s: expected a positive number, got {self.deadline_s!r}")
+        if self.fifo is not None and not 1 <= self.fifo <= 99:
+            raise UsageError(f"fifo: expected a priority 1..99, got {self.fifo}")
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,9 @@ keep-alive."""
 CLIENT_OPEN_MS = 250
 
 
-def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> dict[str, Any]:
+def _config(
+    mode: str, listen: Sequence[str], connect: Sequence[str], lease_ms: int
+) -> dict[str, Any]:
     return {
         "mode": mode,
         "listen": {"endpoints": list(listen), "exit_on_failure": True},
@@ -71,7 +73,7 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> dict[st
             "link": {
                 "protocols": ["tcp", "unixsock-stream"],
                 "tx": {
-                    "lease": LEASE_MS,
+                    "lease": lease_ms,
                     "keep_alive": 4,
                     "queue": {
                         # Batches per priority: a burst waits here, not in the caller.
@@ -97,15 +99,17 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> dict[st
     }
 
 
-def open_session(mode: str, listen: Sequence[str], connect: Sequence[str]) -> Any:
+def open_session(
+    mode: str, listen: Sequence[str], connect: Sequence[str], *, lease_ms: int = LEASE_MS
+) -> Any:
     """Open the process's Zenoh session; `mode` is "peer" (node), "router" (plant) or "client"
-    (recorder).
+    (recorder). After `lease_ms` without a word the other end takes this process for dead.
 
     Sets ZENOH_RUNTIME, which the library reads once a process, so it must be the first call into
     it. Raises OctarmError if this host does not let it listen there.
     """
     os.environ["ZENOH_RUNTIME"] = RUNTIME_PLANT if mode == "router" else RUNTIME_NODE
-    text = json.dumps(_config(mode, listen, connect))
+    text = json.dumps(_config(mode, listen, connect, lease_ms))
     try:
         return zenoh.open(zenoh.Config.from_json5(text))
     except zenoh.ZError as error:
@@ -160,6 +164,11 @@ def observe(function: Callable[[Any], None]) -> Any:
 def queue(capacity: int) -> Any:
     """A handler that stores samples without Python until they are asked for."""
     return zenoh.handlers.FifoChannel(capacity)
+
+
+def newest(capacity: int) -> Any:
+    """The same, but only so many: the oldest makes room."""
+    return zenoh.handlers.RingChannel(capacity)
 
 
 def control_publisher(session: Any, key: str) -> Any:

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 from closed_form import write_gains
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 MARK = "OCTARM_TEST_RUN"
 PATIENCE_S = 60.0
 
