@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bench.configs import PATIENCE_S, EndRows, Port
-from node.block import Y
-from node.row import OWN
+from node.row import OWN, Y
 from supervise.endpoints import Endpoints
 from supervise.options import MOST_TICKS, RunOptions
 from supervise.plan import Prepared, make_plan, prepare

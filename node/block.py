@@ -17,14 +17,12 @@ from typing import Protocol
 
 import numpy as np
 
-from node.row import RowBlock
+from node.row import RowBlock, Y
 from node.sweep import Array, NodeSweep, Numbers
-from wire.channels import MEASUREMENT
 from wire.errors import UsageError
 from wire.factors import OUTPUTS, STATES
 from wire.messages import Reason, RejectedError
 
-Y = len(MEASUREMENT)
 _total_output = np.ones(OUTPUTS).dot
 _OUTPUT = ("velocity_x", "velocity_y", "strain", "curvature", "command")
 
@@ -101,6 +99,7 @@ class SegmentBlock:
             )
         self._inner = tuple(pairwise(sweeps))
         self._backward_inner = tuple((b, a) for a, b in reversed(self._inner))
+        self._own_measurement = tuple((s, slice(Y * i, Y * i + Y)) for i, s in enumerate(sweeps))
         self._setpoints = frozenset(map(float, range(sweeps[0].setpoints)))
         self._rows = tuple(_rows(sweep, batch) for sweep in sweeps)
         self._batch, self._quota = batch, first_batch or batch
@@ -145,36 +144,31 @@ class SegmentBlock:
         """Take y(k) of all segments; RejectedError if it is here already or not finite."""
         if self._have_y:
             raise self._twice()
-        self._y_ns = at_ns
-        if len(self._sweeps) == 1:
-            self._root.input(values)
-        else:
-            for i, sweep in enumerate(self._sweeps):
-                sweep.input(values[Y * i : Y * i + Y])
-        for sweep in self._sweeps:
-            if not isfinite(sweep.row.y[0] + sweep.row.y[1]):
-                _refuse_not_finite("measurement", values)
-        self._have_y = True
+        _check_finite("measurement", values)
+        for sweep, own in self._own_measurement:
+            sweep.input(values[own])
+        self._have_y, self._y_ns = True, at_ns
         self.began_ns = self.began_ns or at_ns
         if self._have_c:
             self._forward()
         if self._have_d:
             self._backward()
-        if self._have_c and self._have_d:
-            self._finish()
+            if self._have_c:
+                self._finish()
 
     def on_forward(self, values: Numbers, at_ns: int) -> None:
         """Take c of the first segment from its neighbour; RejectedError as above."""
         if self._have_c:
             raise self._twice()
-        if not isfinite(self._root.take_forward(values)):
-            _refuse_not_finite("forward sum", values)
-        self._have_c, self._c_ns = True, at_ns
-        self.began_ns = self.began_ns or at_ns
+        if not self._have_y or self._tip.last:  # else the sum that goes on tells
+            _check_finite("forward sum", values)
+        self._root.take_forward(values)
         if self._have_y:
             self._forward()
-            if self._have_d:
-                self._finish()
+        self._have_c, self._c_ns = True, at_ns
+        self.began_ns = self.began_ns or at_ns
+        if self._have_y and self._have_d:
+            self._finish()
 
     def on_backward(self, values: Numbers, at_ns: int) -> None:
         """Take d of the last segment from its neighbour; RejectedError as above, also for an announced setpoint
@@ -186,14 +180,15 @@ class SegmentBlock:
                 Reason.SETPOINT,
                 f"expected one of {len(self._setpoints)} setpoints, got {float(values[-1])!r}",
             )
-        if not isfinite(self._tip.take_backward(values)):
-            _refuse_not_finite("backward sum", values)
-        self._have_d, self._d_ns = True, at_ns
-        self.began_ns = self.began_ns or at_ns
+        if not self._have_y or self._root.first:
+            _check_finite("backward sum", values)
+        self._tip.take_backward(values)
         if self._have_y:
             self._backward()
-            if self._have_c:
-                self._finish()
+        self._have_d, self._d_ns = True, at_ns
+        self.began_ns = self.began_ns or at_ns
+        if self._have_y and self._have_c:
+            self._finish()
 
     def skip_to(self, tick: int) -> None:
         """Nothing of this tick will come, the next is `tick`: the ticks between had no sweep."""
@@ -215,8 +210,10 @@ class SegmentBlock:
         last = self._tip
         if not last.last:
             numbers = last.forward_sum()
+            # a product with ones is the quickest sum of a short array; what is not finite stays so in products
             if not isfinite(self._total_forward(numbers)):
-                self._check(numbers, "forward sum", last)
+                _refuse_not_finite("forward sum", self._root.row.c)
+                self._explain(numbers, "forward sum", last)
             self._outlet.send_forward(self.tick, last.setpoint)
 
     def _backward(self) -> None:
@@ -228,7 +225,8 @@ class SegmentBlock:
         if not first.first:
             numbers = first.backward_sum()
             if not isfinite(self._total_backward(numbers)):
-                self._check(numbers, "backward sum", first)
+                _refuse_not_finite("backward sum", self._tip.row.d)
+                self._explain(numbers, "backward sum", first)
             self._outlet.send_backward(self.tick, first.setpoint)
 
     def _finish(self) -> None:
@@ -237,7 +235,7 @@ class SegmentBlock:
         for i, sweep in enumerate(sweeps):
             output = sweep.output()
             if not isfinite(_total_output(output)):
-                self._check(output, "estimate or command", sweep)
+                self._explain(output, "estimate or command", sweep)
             commands[i] = output[STATES]
         outlet.send_commands(self.tick, self._root.next_setpoint)
         sent_ns = monotonic_ns()
@@ -268,7 +266,7 @@ class SegmentBlock:
     def _hand_over(self, next_tick: int) -> None:
         """Give a copy of the filled rows away, and fill them anew."""
         if self._filled:
-            rows = [block.array[: self._filled].copy() for block in self._rows]
+            rows = [block.telemetry(self._filled) for block in self._rows]
             self._outlet.recorded(next_tick - self._filled, rows)
             self._filled, self._quota = 0, self._batch
 
@@ -277,7 +275,8 @@ class SegmentBlock:
     def _twice(self) -> RejectedError:
         return RejectedError(Reason.DUPLICATE, f"tick {self.tick} has it already")
 
-    def _check(self, numbers: Array, field: str, sweep: NodeSweep) -> None:
+    def _explain(self, numbers: Array, field: str, sweep: NodeSweep) -> None:
+        """A total is not finite: fail for the number that is not, or it only overflowed."""
         wrong = np.flatnonzero(~np.isfinite(numbers))
         if wrong.size:
             at = int(wrong[0])
@@ -310,6 +309,11 @@ def _note(sweep: NodeSweep, instants: list[int]) -> None:
         row[1] = instants[1]
     if not sweep.last:
         row[-2] = instants[2]
+
+
+def _check_finite(field: str, values: Numbers) -> None:
+    if not isfinite(sum(values)):
+        _refuse_not_finite(field, values)
 
 
 def _refuse_not_finite(field: str, values: Numbers) -> None:

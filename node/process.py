@@ -17,7 +17,8 @@ from threading import Lock
 from time import monotonic_ns
 from typing import Any
 
-from node.block import NotFiniteError, SegmentBlock, Y
+from node.block import NotFiniteError, SegmentBlock
+from node.row import Y
 from node.scheduling import Sectors
 from node.sweep import Array, NodeSweep, Numbers
 from wire import session as zsession

@@ -24,6 +24,8 @@ def grow(
     stretched."""
     turn, x, y = end
     turn += turn_rad
+    if not math.isfinite(turn):  # it has no cosine; the caller sees that nothing is right here
+        return turn, math.nan, math.nan
     cosine, sine = stretch * math.cos(turn), stretch * math.sin(turn)
     return (
         turn,

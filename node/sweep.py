@@ -7,8 +7,8 @@ command (theory, section 5):
     d_previous = sweep.backward(d)   to the root's side, once d is there (empty at the tip)
     sweep.accept(sweep.output())     the state of the next tick
 
-What depends on the input alone is multiplied when the measurement comes, so that a sum that arrives waits for
-one small product only; the order of the additions is the same whatever comes first, and so are the bits.
+Each of the three results is one product of a matrix with numbers that stand side by side in the tick's row
+(`node.row`), so it is the same bit for bit whatever comes first.
 Matrices act on the deviation from the reference, out = M (in - in_ref(k)) + out_ref(k+1); which setpoint's
 they are is decided by the tip node (`node.scheduling`). For that the sums are longer than the products: c ends
 with turn and end of the arm so far, d with the setpoint of the next tick.
@@ -21,7 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from node.row import TickRow
+from node.row import TickRow, Y, columns
 from node.scheduling import CLAMP, ArmEnd, Sectors, grow
 from wire.errors import OctarmError, UsageError
 from wire.factors import (
@@ -37,36 +37,25 @@ from wire.reference import TERMS, Leg, Reference
 
 Array = npt.NDArray[np.float64]
 Numbers = Array | Sequence[float]
-add, subtract = np.add, np.subtract
 
 CHORD = 2
 """Numbers of a reference behind state and command: x and y from the inner to the outer face, m."""
 MEASURED = [1, 3]
 """Which of the state's components are measured: v_y and k."""
-_AS_ROWS_HAVE_IT = [5, 6, 0, 1, 2, 3, 4]
-"""The factors' input (estimate, command, measurement) in the order of a row: measurement first."""
 _COMMAND = INPUTS - 1
-"""Where a row's input has the command."""
+"""Where a row's deviation has the command."""
+add, subtract = np.add, np.subtract
 
 
 class _Products:
-    """The factors of one setpoint, stacked by what they are multiplied with, and where the products go."""
+    """The factors of one setpoint as three matrices that multiply parts of a row, bound once."""
 
-    def __init__(self, factors: SweepFactors) -> None:
-        of_input = np.vstack([factors.Q, factors.R, factors.D])[:, _AS_ROWS_HAVE_IT]
-        self.of_input = np.ascontiguousarray(of_input)
-        self.of_c = np.ascontiguousarray(np.vstack([factors.W, factors.P]))
-        self.of_d = np.ascontiguousarray(np.vstack([factors.V, factors.U]))
-        c, d = factors.forward_sent, factors.backward_sent
-        # bound once: these are the products of every tick
-        self.multiply_input = self.of_input.dot
-        self.multiply_c, self.multiply_d = self.of_c.dot, self.of_d.dot
-        self.from_input = np.zeros(c + d + OUTPUTS)
-        self.from_c, self.from_d = np.zeros(c + OUTPUTS), np.zeros(d + OUTPUTS)
-        self.c_of_input, self.c_of_c = self.from_input[:c], self.from_c[:c]
-        self.d_of_input, self.d_of_d = self.from_input[c : c + d], self.from_d[:d]
-        self.out_of_input = self.from_input[c + d :]
-        self.out_of_c, self.out_of_d = self.from_c[c:], self.from_d[d:]
+    def __init__(self, factors: SweepFactors, *, first: bool, last: bool) -> None:
+        W, P = (None, None) if first else (factors.W, factors.P)
+        V, U = (None, None) if last else (factors.V, factors.U)
+        self.forward = columns(W, factors.Q, None).dot
+        self.backward = columns(None, factors.R, V).dot
+        self.output = columns(P, factors.D, U).dot
 
 
 def resting_at(factors: SweepFactors) -> Reference:
@@ -110,7 +99,9 @@ class NodeSweep:
         self.last = factors.index == factors.nodes - 1
         """Whether this is the tip's node."""
         self._bend = factors.bend_m
-        self._products = [_Products(one) for one in factors.setpoints]
+        self._products = [
+            _Products(one, first=self.first, last=self.last) for one in factors.setpoints
+        ]
         self.select(setpoint)
         self._decided = setpoint
         self._announced = setpoint
@@ -120,21 +111,15 @@ class NodeSweep:
         self._fade = fade
         self._next_bump = 0.0
         self._reference = reference or resting_at(factors.setpoints[setpoint])
-        self._now = self._reference.at(0)
-        self._expect(self._reference.at(1))
+        self._now, self._then = self._reference.at(0), self._reference.at(1)
         if self._now.shape != (OUTPUTS + CHORD,):
             raise UsageError(
                 f"node {self.index}: expected a reference of {OUTPUTS + CHORD} numbers, got "
                 f"{self._now.size}; deploy the gains again"
             )
-        self._offset = np.zeros(INPUTS)
-        self._deviation = np.zeros(INPUTS)
-        self._aimed = self._now
-        self._aim()
         self._output = np.zeros(OUTPUTS)
-        # a product with ones is the quickest sum of a short array
-        self._total_c = np.ones(self.forward_received).dot
-        self._total_d = np.ones(self.backward_received).dot
+        self._offset = np.zeros(INPUTS)
+        self._aim()
         sums = factors.setpoints[0]
         self.forward_sent = 0 if self.last else sums.forward_sent + FORWARD_EXTRA
         """How many numbers the sum to the tip's side has."""
@@ -203,66 +188,49 @@ class NodeSweep:
     # -- a tick -----------------------------------------------------------------------------------
 
     def input(self, measurement: Numbers) -> Array:
-        """Take the measurement (v_y, k): all that depends on this node alone. Returns the input, as a row has
-        it: measurement, estimate, command (7,)."""
-        row, p = self.row, self._active
+        """Take the measurement (v_y, k).
+
+        Returns the input as a row has it: measurement, estimate, command (7,).
+        """
+        row = self.row
         row.y[:] = measurement
-        subtract(row.x, self._offset, self._deviation)
-        p.multiply_input(self._deviation, p.from_input)
+        subtract(row.x, self._offset, row.deviation)
         return row.x
 
-    def take_forward(self, c: Numbers) -> float:
-        """Take the sum from the root's side and multiply it; returns its total, finite only if all of it is."""
-        row, p = self.row, self._active
+    def take_forward(self, c: Numbers) -> None:
+        """Take the sum from the root's side."""
         if len(c) != self.forward_received:
             raise self._wrong_length("forward", len(c), self.forward_received)
-        row.c[:] = c
-        p.multiply_c(row.c_sum, p.from_c)
-        total: float = self._total_c(row.c)
-        return total
+        self.row.c[:] = c
 
-    def take_backward(self, d: Numbers) -> float:
-        """Take the sum from the tip's side and multiply it; returns its total, finite only if all of it is."""
-        row, p = self.row, self._active
+    def take_backward(self, d: Numbers) -> None:
+        """Take the sum from the tip's side."""
         if len(d) != self.backward_received:
             raise self._wrong_length("backward", len(d), self.backward_received)
-        row.d[:] = d
-        p.multiply_d(row.d_sum, p.from_d)
-        total: float = self._total_d(row.d)
-        return total
+        self.row.d[:] = d
 
     def forward_sum(self) -> Array:
         """W c + Q (in - in_ref) and the arm with this segment, after `input` and `take_forward`."""
-        p = self._active
-        if self.first:
-            self._c_sum[:] = p.c_of_input
-        else:
-            add(p.c_of_c, p.c_of_input, self._c_sum)
-        out = self._c_next
+        row, out = self.row, self._c_next
+        self._active.forward(row.of_forward, self._c_sum)
         out[-3], out[-2], out[-1] = self._grown()
         return out
 
     def backward_sum(self) -> Array:
         """V d + R (in - in_ref) and the next setpoint, after `input` and `take_backward`."""
-        p = self._active
-        if self.last:
-            self._d_sum[:] = p.d_of_input
-            self._d_previous[-1] = self._decided
-        else:
-            add(p.d_of_d, p.d_of_input, self._d_sum)
-            self._d_previous[-1] = self.row.d[-1]
-        return self._d_previous
+        row, out = self.row, self._d_previous
+        self._active.backward(row.of_backward, self._d_sum)
+        out[-1] = self._decided if self.last else row.d[-1]
+        return out
 
     def forward(self, c: Numbers) -> Array:
         """Take c; the sum for the tip's side, after `input`; empty at the tip node."""
-        if not self.first:
-            self.take_forward(c)
+        self.take_forward(c)
         return self._c_next if self.last else self.forward_sum()
 
     def backward(self, d: Numbers) -> Array:
         """Take d; the sum for the root's side, after `input`; empty at the root node."""
-        if not self.last:
-            self.take_backward(d)
+        self.take_backward(d)
         return self._d_previous if self.first else self.backward_sum()
 
     def output(self) -> Array:
@@ -271,15 +239,10 @@ class NodeSweep:
         In the first tick after a change of gains the command's deviation from the reference stays what it
         was: what the new gains want differently is the bump, which is faded out.
         """
-        p, out = self._active, self._output
-        if self.first:
-            add(p.out_of_input, p.out_of_d, out)
-        else:
-            add(p.out_of_input, p.out_of_c, out)
-            if not self.last:
-                add(out, p.out_of_d, out)
+        out = self._output
+        self._active.output(self.row.of_output, out)
         if self._changed:
-            self._next_bump = float(self._deviation[_COMMAND] - out[STATES])
+            self._next_bump = float(self.row.deviation[_COMMAND] - out[STATES])
         else:
             self._next_bump = self.bump * self._fade
         if self._next_bump:
@@ -296,13 +259,11 @@ class NodeSweep:
             row, self._spare = self._spare, self.row
         row.state[:] = output
         self.row = row
-        self.tick += 1
+        self.tick = tick = self.tick + 1
         self.bump = self._next_bump
-        self._now = self._then
-        then = self._reference.at(self.tick + 1)
-        if then is not self._then:
-            self._expect(then)
-        if self._aimed is not self._now:
+        then = self._reference.at(tick + 1)
+        if then is not self._then or then is not self._now:  # the reference moves
+            self._now, self._then = self._then, then
             self._aim()
         self._changed = self._announced != self._setpoint
         if self._changed:
@@ -316,28 +277,24 @@ class NodeSweep:
         is the one that is held."""
         before = self._now
         self.tick = tick
-        self._now = self._reference.at(tick)
-        self._expect(self._reference.at(tick + 1))
+        self._now, self._then = self._reference.at(tick), self._reference.at(tick + 1)
         if self._now is not before:
             self.estimate[:] += self._now[:STATES] - before[:STATES]
-        if self._aimed is not self._now:
-            self._aim()
+        self._aim()
 
     # -- parts ------------------------------------------------------------------------------------
 
     def _label_row(self) -> None:
-        self.row.schedule[0], self.row.schedule[1] = self._setpoint, self.bump
-
-    def _expect(self, then: Array) -> None:
-        """The reference of the next tick."""
-        self._then, self._then_output = then, then[:OUTPUTS]
+        schedule = self.row.schedule
+        schedule[0], schedule[1] = self._setpoint, self.bump
 
     def _aim(self) -> None:
-        """The reference of this tick as an offset of the input: its measurement is part of its state."""
-        self._offset[:2] = self._now[MEASURED]
-        self._offset[2:] = self._now[:OUTPUTS]
-        self._aimed = self._now
-        _, _, self._strain, self._curvature, _, self._chord_x, self._chord_y = self._now.tolist()
+        """The reference of this tick as an offset of the input, that of the next as one of the output; the
+        measurement's reference is part of the state's."""
+        now = self._now
+        self._offset[:Y], self._offset[Y:] = now[MEASURED], now[:OUTPUTS]
+        self._then_output = self._then[:OUTPUTS]
+        _, _, self._strain, self._curvature, _, self._chord_x, self._chord_y = now.tolist()
 
     def _grown(self) -> tuple[float, float, float]:
         """Where the estimated arm ends at this segment's outer face, as `ArmEnd`."""

@@ -235,7 +235,7 @@ def test_a_message_of_a_later_tick_leaves_out_those_between(paced: Bench) -> Non
 
 
 def raw_width(bench: Bench) -> int:
-    return int(bench.process._block._rows[0].array.shape[1])
+    return int(bench.process._block._rows[0].telemetry(1).shape[1])
 
 
 @pytest.mark.parametrize("what", list(INCOMING))

@@ -152,19 +152,6 @@ def test_products_use_their_own_arguments_only() -> None:
     np.testing.assert_array_equal(sweep.estimate, node.initial_estimate[0])
 
 
-def test_the_total_of_a_sum_tells_whether_all_of_it_is_finite() -> None:
-    for at in range(5):
-        for bad in (np.nan, np.inf, -np.inf):
-            sweep = NodeSweep(random_node(22, [(2, 3, 4, 5)]))
-            c, d = np.ones(5), np.ones(5)
-            assert np.isfinite(sweep.take_forward(c))
-            assert np.isfinite(sweep.take_backward(d))
-            c[at] = d[at] = bad
-            with np.errstate(all="ignore"):
-                assert not np.isfinite(sweep.take_forward(c))
-                assert not np.isfinite(sweep.take_backward(d))
-
-
 def test_what_a_tick_knows_is_in_its_row() -> None:
     sweep = NodeSweep(random_node(23, [(2, 3, 4, 5)]))
     row = sweep.row
