@@ -49,13 +49,26 @@ GAUSS = 8
 
 @dataclass(frozen=True, eq=False)
 class StructuredStep:
-    """One tick at one setpoint for scaled quantities, as a chain; scales as in `deploy.step.Step`."""
+    """The parts of one tick at one setpoint for scaled quantities, O(n) numbers; scales as in `deploy.step.Step`."""
 
-    chain: ImplicitChain
+    A: Array
+    """(2 REACH + 1, n, 4, 4), as in `deploy.separable.BandedModel`."""
+    B: Array
+    """(n, 4, 1)."""
+    C: Array
+    """(n, 2, 4)."""
+    L: SeparableGain
+    K: SeparableGain
+    tick_s: float
     scale_in: Array
     """(7n,)."""
     scale_out: Array
     """(5n,)."""
+
+    @property
+    def chain(self) -> ImplicitChain:
+        """The whole tick as relations of neighbours."""
+        return _chain(self.A, self.B, self.C, self.L, self.K, self.tick_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +141,12 @@ def structured_step(arm: Arm, setpoint: Setpoint, grid: SegmentGrid, tick_s: flo
             f"{1.0 / rate:.3g} s; use a tick well below that"
         )
     return StructuredStep(
-        chain=_chain(A, B, select, L, K, tick_s),
+        A=A,
+        B=B,
+        C=select,
+        L=L,
+        K=K,
+        tick_s=tick_s,
         scale_in=np.hstack([x, u, y]).ravel(),
         scale_out=np.hstack([x, u]).ravel(),
     )
