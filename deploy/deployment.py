@@ -22,7 +22,7 @@ from deploy.grid import MEASURED_STATES, Place, SegmentGrid, make_grid
 from deploy.held import Holder
 from deploy.semiseparable import NodeMatrices, multiply, realise
 from deploy.stability import SpectralRadius, longest_stable_tick, spectral_radius
-from deploy.step import Loop, Step, gain_rate, make_loop, make_step
+from deploy.step import Loop, gain_rate, make_loop, make_step
 from wire.artefact import Arm, GainsArtefact, Setpoint
 from wire.errors import OctarmError, UsageError
 from wire.factors import INPUTS, OUTPUTS, STATES, NodeFactors, SweepFactors
@@ -230,7 +230,10 @@ def in_si(
     in_offset: Array,
     out_offset: Array,
 ) -> list[SweepFactors]:
-    """Factors for inputs and outputs in SI; the sums stay in scaled units (sqrt of an energy). Scales as in `Step`."""
+    """Factors for inputs and outputs in SI; the sums stay in scaled units (sqrt of an energy).
+
+    Scales as in `deploy.step.Step`.
+    """
     inputs = scale_in.reshape(-1, INPUTS)
     outputs = 1.0 / scale_out.reshape(-1, OUTPUTS, 1)
     return [
@@ -249,9 +252,7 @@ def in_si(
     ]
 
 
-def node_factors(
-    index: int, factors: Sequence[SweepFactors], grid: SegmentGrid
-) -> NodeFactors:
+def node_factors(index: int, factors: Sequence[SweepFactors], grid: SegmentGrid) -> NodeFactors:
     """One node's factors at all setpoints, sums padded to one length."""
     start = np.stack([one.out_offset for one in factors])
     return NodeFactors(

@@ -1,7 +1,7 @@
-"""One tick of observer and controller by a banded solve and two fixed points, whatever n: what sweeps must equal.
+"""One tick of observer and controller by a banded solve and two fixed points: what sweeps must equal.
 
-Beside `deploy.structured`, from the same parts but without sums, reflections or ranks; a check for chains whose dense
-matrix does not fit.
+Beside `deploy.structured`, from the same parts but without sums, reflections or ranks; a check for chains whose
+dense matrix does not fit.
 """
 
 from __future__ import annotations

@@ -1,14 +1,13 @@
-"""A chain in which every node's relation uses what both neighbours' relations give, to sums that run one way each.
+"""A chain in which every node uses what both neighbours give, to sums that run one way each.
 
-Between `deploy.structured`, which writes a tick as such a chain, and `deploy.shorten`. Node i takes a_i from the
-root's side and b_i from the tip's side, and a_(i+1), b_(i-1) depend on both: nothing can be computed in one pass.
-With the reflections of what lies on either side of a cut, known beforehand,
+Between `deploy.structured`, which writes a tick as such a chain, and `deploy.shorten`. Node i takes a_i from
+the root's side and b_i from the tip's side, and a_(i+1), b_(i-1) depend on both: nothing can be computed in one
+pass. With the reflections of what lies on either side of a cut, known beforehand,
 
     a_(i+1) = G_i b_i + c_(i+1),   b_(i-1) = H_i a_i + d_(i-1),
 
-c and d can: c depends on the inputs on the root's side only, d on those on the tip's side (block elimination from
-both ends; the generators of the inverse of a semiseparable matrix, Chandrasekaran et al. 2005 [SIAM J. Matrix
-Anal. Appl. 27(2)], are found like this).
+c and d can: c depends on the inputs on the root's side only, d on those on the tip's side. It is block
+elimination from both ends, as for the inverse of a semiseparable matrix (Rice and Verhaegen 2009).
 """
 
 from __future__ import annotations
@@ -88,8 +87,14 @@ def _chunk(chain: ImplicitChain, root: Array, tip: Array, part: slice) -> list[N
     out = np.concatenate([oa, ob], axis=2) @ both
     P, U, D = out[:, :, :a], out[:, :, a : a + b], chain.oi[part] + out[:, :, a + b :]
     # the sums themselves, without the other side
-    c = np.linalg.solve(np.eye(a) - G @ ba, np.concatenate([np.broadcast_to(np.eye(a), (nodes, a, a)), G @ bi], axis=2))
-    d = np.linalg.solve(np.eye(b) - H @ ab, np.concatenate([np.broadcast_to(np.eye(b), (nodes, b, b)), H @ ai], axis=2))
+    c = np.linalg.solve(
+        np.eye(a) - G @ ba,
+        np.concatenate([np.broadcast_to(np.eye(a), (nodes, a, a)), G @ bi], axis=2),
+    )
+    d = np.linalg.solve(
+        np.eye(b) - H @ ab,
+        np.concatenate([np.broadcast_to(np.eye(b), (nodes, b, b)), H @ ai], axis=2),
+    )
     W, Q = aa @ c[:, :, :a], ai + aa @ c[:, :, a:]
     V, R = bb @ d[:, :, :b], bi + bb @ d[:, :, b:]
     return [

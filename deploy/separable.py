@@ -1,7 +1,7 @@
 """Model and gains of one setpoint on n segments without a matrix of n columns: bands, and kernels as factors.
 
-Between gains artefact and `deploy.structured`. The same numbers as `deploy.model` and `deploy.operators`, block by
-block: what is farther than a neighbour apart is the product of a factor at the output and one at the input.
+Between gains artefact and `deploy.structured`. The same numbers as `deploy.model` and `deploy.operators`, block
+by block: what is farther than a neighbour apart is the product of a factor at the output and one at the input.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy.sparse.linalg import LinearOperator, svds
 
 from deploy.grid import Place, SegmentGrid
 from deploy.model import tangent_angle
-from wire.artefact import Arm, OperatorFactors
+from wire.artefact import Arm, OperatorFactors, PolynomialMatrix
 
 Array = npt.NDArray[np.float64]
 
@@ -48,9 +48,7 @@ class SeparableGain:
 
     def __call__(self, x: Array) -> Array:
         """Apply to x (n, inputs): (n, outputs), in O(n)."""
-        out = sum(
-            np.einsum("nab,nb->na", self.band[1 + o], shifted(x, o)) for o in (-1, 0, 1)
-        )
+        out = sum(np.einsum("nab,nb->na", self.band[1 + o], shifted(x, o)) for o in (-1, 0, 1))
         low = np.cumsum(np.einsum("nrb,nb->nr", self.lower_b, x), axis=0)
         high = np.cumsum(np.einsum("nrb,nb->nr", self.upper_b, x)[::-1], axis=0)[::-1]
         out = out + np.einsum("nar,nr->na", self.lower_a, shifted(low, -2))
@@ -73,12 +71,18 @@ class SeparableGain:
         """The same for scaled quantities: outputs (n, outputs) times, inputs (n, inputs) divided by."""
         out = outputs[:, :, None]
         band = [
-            out * self.band[1 + o] / np.where(shifted(inputs, o) == 0.0, 1.0, shifted(inputs, o))[:, None, :]
+            out
+            * self.band[1 + o]
+            / np.where(shifted(inputs, o) == 0.0, 1.0, shifted(inputs, o))[:, None, :]
             for o in (-1, 0, 1)
         ]
         by = inputs[:, None, :]
         return SeparableGain(
-            np.stack(band), out * self.lower_a, self.lower_b / by, out * self.upper_a, self.upper_b / by
+            np.stack(band),
+            out * self.lower_a,
+            self.lower_b / by,
+            out * self.upper_a,
+            self.upper_b / by,
         )
 
     def composed(self, before: Array | None = None, after: Array | None = None) -> SeparableGain:
@@ -141,11 +145,8 @@ def separable_gain(
     return SeparableGain(band, lower_a, lower * cells, upper_a, upper * cells)
 
 
-def _right(matrix: object, grid: SegmentGrid, place: Place, column: int) -> Array:
+def _right(matrix: PolynomialMatrix, grid: SegmentGrid, place: Place, column: int) -> Array:
     """Right factor (n, rank) of one input at its places; no terms: (n, 0)."""
-    from wire.artefact import PolynomialMatrix
-
-    assert isinstance(matrix, PolynomialMatrix)
     if not matrix.coefficients:
         return np.zeros((grid.nodes, 0))
     return matrix(grid.locations_m(place), grid.length_m)[:, :, column]

@@ -1,8 +1,8 @@
 """Sums to the shortest sums of the same map: from long node matrices to those that nodes run.
 
-Between `deploy.implicit_chain` and the factors of a node. The result has the form that `deploy.semiseparable.realise`
-gives for a dense matrix: [W Q] and [V R] with orthonormal rows, singular values of the Hankel blocks above a
-threshold. Cost: a QR and an SVD of a matrix of the sums' lengths a node and direction.
+Between `deploy.implicit_chain` and the factors of a node. The result has the form that
+`deploy.semiseparable.realise` gives for a dense matrix: [W Q] and [V R] with orthonormal rows, singular values
+of the Hankel blocks above a threshold. Cost: a QR and an SVD of the sums' lengths a node and direction.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def _one_direction(
     read[n] = np.zeros((0, sums[-1][1].shape[0]))
     for i in range(n - 1, 0, -1):
         P, W, _ = sums[i]
-        read[i] = np.linalg.qr(np.vstack([P, read[i + 1] @ W]), mode="r")
+        read[i] = np.asarray(np.linalg.qr(np.vstack([P, read[i + 1] @ W]), mode="r"))
     out = []
     T = np.zeros((sums[0][1].shape[1], 0))
     for i, (P, W, Q) in enumerate(sums):
@@ -69,7 +69,6 @@ def _largest_column(nodes: Sequence[NodeMatrices], at: npt.NDArray[np.int64]) ->
     unit = np.zeros((len(nodes), inputs, len(at) * inputs))
     for k, node in enumerate(at):
         unit[node, :, k * inputs : (k + 1) * inputs] = np.eye(inputs)
-    total = np.zeros(unit.shape[2])
     # `deploy.semiseparable.multiply` for many columns at once
     out = np.stack([m.D @ unit[i] for i, m in enumerate(nodes)])
     c = np.zeros((nodes[0].W.shape[1], unit.shape[2]))
@@ -81,8 +80,7 @@ def _largest_column(nodes: Sequence[NodeMatrices], at: npt.NDArray[np.int64]) ->
         m = nodes[i]
         out[i] += m.U @ d
         d = m.V @ d + m.R @ unit[i]
-    total = np.abs(out).sum(axis=(0, 1))
-    return float(total.max())
+    return float(np.abs(out).sum(axis=(0, 1)).max())
 
 
 def _transposed(nodes: Sequence[NodeMatrices]) -> list[NodeMatrices]:

@@ -1,8 +1,9 @@
 """The factors of every node without a matrix of n columns: `deploy` for chains of thousands of segments.
 
-From gains artefact to `NodeFactors`, the same map as `deploy.deployment.deploy`, in O(n) time and memory. The tick of
-`deploy.step` is written as a chain of small implicit relations (what a node's innovation, predicted state and
-command take from its neighbours and from the running sums of the gains), whose elimination gives the sums.
+From gains artefact to `NodeFactors`, the same map as `deploy.deployment.deploy`, in O(n) time and memory. The
+tick of `deploy.step` is written as a chain of small implicit relations (what a node's innovation, predicted
+state and command take from its neighbours and from the running sums of the gains), whose elimination gives the
+sums.
 Nothing here says whether the sampled loop is stable: that is for `deploy`, whose eigenvalues need the matrix.
 """
 
@@ -30,7 +31,6 @@ from deploy.grid import (
     make_grid,
 )
 from deploy.implicit_chain import ImplicitChain, one_way_sums
-from deploy.semiseparable import NodeMatrices
 from deploy.separable import REACH, SeparableGain, banded_model, separable_gain, shifted
 from deploy.shorten import shorten
 from deploy.step import IMPLICITNESS
@@ -41,15 +41,15 @@ from wire.factors import INPUTS, OUTPUTS, STATES, NodeFactors, SweepFactors
 Array = npt.NDArray[np.float64]
 
 MOST_HELD = 200
-"""Up to so many segments the setpoint is what the commands really hold (`deploy.held`, 800 cells, dense); beyond,
-the difference is of second order in the segment length and the setpoint itself is taken."""
+"""Up to so many segments the setpoint is what the commands really hold (`deploy.held`, 800 cells, dense);
+beyond, the difference is of second order in the segment length and the setpoint itself is taken."""
 GAUSS = 8
 """Quadrature points a segment for the load of a command."""
 
 
 @dataclass(frozen=True, eq=False)
 class StructuredStep:
-    """The parts of one tick at one setpoint for scaled quantities, O(n) numbers; scales as in `deploy.step.Step`."""
+    """The parts of one tick at one setpoint for scaled quantities, O(n) numbers; scales as in `deploy.step`."""
 
     A: Array
     """(2 REACH + 1, n, 4, 4), as in `deploy.separable.BandedModel`."""
@@ -114,7 +114,9 @@ def structured_deploy(
     )
 
 
-def structured_step(arm: Arm, setpoint: Setpoint, grid: SegmentGrid, tick_s: float) -> StructuredStep:
+def structured_step(
+    arm: Arm, setpoint: Setpoint, grid: SegmentGrid, tick_s: float
+) -> StructuredStep:
     """The tick of `deploy.step.make_step` as an implicit chain; UsageError for a tick that is too long."""
     model = banded_model(arm, setpoint.curvature_per_m, grid)
     x = np.sqrt(2.0 * model.energy_weights)
@@ -127,7 +129,9 @@ def structured_step(arm: Arm, setpoint: Setpoint, grid: SegmentGrid, tick_s: flo
     L = separable_gain(setpoint.observer, grid, STATE_PLACES, MEASUREMENT_PLACES).scaled(x, y)
     A = np.stack(
         [
-            x[:, :, None] * model.A[REACH + o] / np.where(inside := shifted(x, o), inside, 1.0)[:, None]
+            x[:, :, None]
+            * model.A[REACH + o]
+            / np.where(inside := shifted(x, o), inside, 1.0)[:, None]
             for o in range(-REACH, REACH + 1)
         ]
     )
@@ -188,7 +192,7 @@ def _chain(
     own = w["u"].stop
 
     # columns: own unknowns, a, b, inputs
-    def columns(rows: int) -> tuple[Array, Array, Array, Array, Array]:
+    def columns(rows: int) -> tuple[Array, ...]:
         whole = np.zeros((n, rows, own + na + nb + INPUTS))
         return whole, *np.split(whole, [own, own + na, own + na + nb], axis=2)
 
@@ -264,16 +268,18 @@ def setpoint_offsets(arm: Arm, setpoint: Setpoint, grid: SegmentGrid) -> tuple[A
     for column, place, one in ((2, Place.CENTRE, rest.strain), (3, Place.INNER_FACE, series)):
         places = 2.0 * grid.locations_m(place) / grid.length_m - 1.0
         out[:, column] = legendre.legval(places, one)
-    out[:, 4] = _projected(rest.load_n_per_m, grid)
+    out[:, 4] = projected(rest.load_n_per_m, grid)
     return np.hstack([out, out[:, MEASURED_STATES]]), out
 
 
-def _projected(series: Array, grid: SegmentGrid) -> Array:
-    """`deploy.feedforward.holding_commands` with a tridiagonal matrix: commands (n,) of the nearest load in L2."""
+def projected(series: Array, grid: SegmentGrid) -> Array:
+    """`deploy.feedforward.holding_commands` with a tridiagonal matrix: commands (n,), series in 2 s / L - 1."""
     x, weights = legendre.leggauss(GAUSS)
     width, n = grid.cell_widths_m, grid.nodes
     places = grid.faces_m[:-1, None] + 0.5 * width[:, None] * (x + 1.0)
-    load = legendre.legval(2.0 * places / grid.length_m - 1.0, series) * weights * 0.5 * width[:, None]
+    load = (
+        legendre.legval(2.0 * places / grid.length_m - 1.0, series) * weights * 0.5 * width[:, None]
+    )
     up = 0.5 * (x + 1.0)  # of the outer face's command on its segment; on the first one 1
     right = load @ up
     right[0] = load[0].sum()

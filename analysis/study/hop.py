@@ -1,7 +1,7 @@
 """How long a message takes from one process to the next on this machine: two processes, a Zenoh session each.
 
-First step of the study of growth, whose simulated links draw from these samples. A ping-pong through `wire.session`
-as nodes use it, over a unix socket; half a round trip is a hop.
+First step of the study of growth, whose simulated links draw from these samples. A ping-pong through
+`wire.session` as nodes use it, over a unix socket; half a round trip is a hop.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ def hop_of_file(path: Path) -> Hop:
     try:
         found = json.loads(path.read_text())
         samples = np.asarray(found["hop_us"], dtype=np.float64)
-        cpu = float(found.get("cpu_us", np.median(samples)))
+        cpu = found.get("cpu_us")
+        cpu = None if cpu is None else float(cpu)
     except OSError as error:
         raise UsageError(f"--latency {path}: {error.strerror or error}") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -65,6 +66,8 @@ def hop_of_file(path: Path) -> Hop:
         ) from None
     if samples.ndim != 1 or not samples.size or not (np.isfinite(samples) & (samples > 0.0)).all():
         raise UsageError(f"--latency {path}: hop_us: expected a list of positive numbers, in us")
+    if cpu is None:
+        cpu = float(np.median(samples))
     if not 0.0 < cpu < np.inf:
         raise UsageError(f"--latency {path}: cpu_us: expected a positive number, got {cpu!r}")
     return Hop(samples, samples, cpu, str(path))

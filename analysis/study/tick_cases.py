@@ -80,9 +80,7 @@ def draw(hosts: Hosts, costs: Costs, processes: int, random: np.random.Generator
     )
 
 
-def tick_times(
-    hosts: Hosts, costs: Costs, processes: int, ticks: int, seed: int
-) -> dict[str, Any]:
+def tick_times(hosts: Hosts, costs: Costs, processes: int, ticks: int, seed: int) -> dict[str, Any]:
     """Percentiles over simulated ticks, each from rest: ms, and how busy the busiest core is meanwhile."""
     random = np.random.default_rng(seed)
     core = hosts.cores(processes)

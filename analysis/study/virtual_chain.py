@@ -1,8 +1,9 @@
-"""One tick of a chain of node processes, event by event, without processes: when messages arrive and what they say.
+"""One tick of a chain of node processes, event by event, in one process: when messages arrive, what they say.
 
-Between the factors of a deployment and `analysis.study.growth`. The nodes are the real ones (`node.block`), only
-what carries their messages is simulated: every message arrives after a latency and keeps the core of its receiver
-busy for a service time; a core serves what arrives one after the other.
+Between the factors of a deployment and `analysis.study.growth`. The nodes are the real ones (`node.block`),
+only what carries their messages is simulated: every message arrives after a latency and keeps the core of its
+receiver busy for a service time; a core serves what arrives one after the other. What a handling sends leaves
+at its end.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from heapq import heappop, heappush
-from time import perf_counter_ns
+from time import thread_time_ns
 from typing import Protocol
 
 import numpy as np
@@ -98,7 +99,9 @@ def run_tick(
         busy[c] += needed
         end = max(end, now)
         for to, sums in members[i].take(what, values):
-            there, delay = (i + 1, latency[i][0]) if to is What.FORWARD else (i - 1, latency[i - 1][1])
+            there, delay = (
+                (i + 1, latency[i][0]) if to is What.FORWARD else (i - 1, latency[i - 1][1])
+            )
             heappush(events, (now + delay, serial, there, to, sums))
             serial += 1
             messages += 1
@@ -154,7 +157,7 @@ class VirtualNode:
         self.backward: Array = np.zeros(self.sweeps[0].backward_sent)
         self.commands: Array = np.zeros(len(factors))
         self.handling_ns: tuple[list[int], list[int], list[int]] = ([], [], [])
-        """How long the node's own code took, by `What`."""
+        """Processor time of the node's own code, by `What`."""
         self._sent: list[tuple[What, Array]] = []
         self._began = False
         self._block = SegmentBlock(self.sweeps, self)
@@ -167,9 +170,9 @@ class VirtualNode:
     def take(self, what: What, values: Array) -> list[tuple[What, Array]]:
         """See `Member`."""
         self._sent = []
-        before = perf_counter_ns()
-        self._handlers[what](values, before)
-        self.handling_ns[what].append(perf_counter_ns() - before)
+        before = thread_time_ns()  # others' work on the machine does not count
+        self._handlers[what](values, 1)
+        self.handling_ns[what].append(thread_time_ns() - before)
         return self._sent
 
     def done(self) -> bool:
@@ -198,9 +201,7 @@ class VirtualNode:
 
 def virtual_nodes(factors: Sequence[NodeFactors], segments: int) -> list[VirtualNode]:
     """Processes of so many consecutive segments each, the last of what is left."""
-    return [
-        VirtualNode(factors[i : i + segments]) for i in range(0, len(factors), segments)
-    ]
+    return [VirtualNode(factors[i : i + segments]) for i in range(0, len(factors), segments)]
 
 
 def states(nodes: Sequence[VirtualNode]) -> Array:

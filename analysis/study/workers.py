@@ -37,9 +37,10 @@ def call_all(
         return out
     context = multiprocessing.get_context("spawn")
     calls = 1 if fresh else None
-    with _one_thread(), ProcessPoolExecutor(
-        max(1, jobs), context, max_tasks_per_child=calls
-    ) as pool:
+    with (
+        _one_thread(),
+        ProcessPoolExecutor(max(1, jobs), context, max_tasks_per_child=calls) as pool,
+    ):
         futures = [pool.submit(function, *one) for one in arguments]
         try:
             for count, future in enumerate(as_completed(futures)):
