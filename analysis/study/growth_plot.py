@@ -50,7 +50,7 @@ def draw_growth(facts: dict[str, Any], path: Path) -> None:
                 at, p99 = zip(*points, strict=True)
                 legend = name if segments == 1 else None
                 sweep.loglog(
-                    at, p99, style, color=colour, markersize=3.5, linewidth=1.1, label=label
+                    at, p99, style, color=colour, markersize=3.5, linewidth=1.1, label=legend
                 )
     sweep.axhline(1e3 * facts["tick_s"], color="0.4", linewidth=1.0)
     sweep.set_title(
