@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from analysis.study.virtual_chain import (
     states,
     virtual_nodes,
 )
+from analysis.study.workers import call_all
 from deploy import deploy
 from deploy.structured import structured_deploy
 from node.sweep import NodeSweep
@@ -257,6 +259,11 @@ def test_hops_without_processor_time_are_all_of_it(tmp_path: Path) -> None:
 def test_numbers_of_nodes_out_of_range_are_refused(nodes: tuple[int, ...]) -> None:
     with pytest.raises(UsageError, match="nodes: expected"):
         growth.run(GAINS, lambda _: None, nodes=nodes)
+
+
+def test_fresh_calls_have_processes_of_their_own() -> None:
+    pids = call_all(os.getpid, [(), ()], 1, fresh=True)
+    assert len({*pids, os.getpid()}) == 3
 
 
 def test_structured_chain_is_connected() -> None:
