@@ -329,7 +329,7 @@ def animate(
 
 
 def study(
-    name: tyro.conf.Positional[Literal["robustness", "baselines", "convergence"]],
+    name: tyro.conf.Positional[Literal["robustness", "baselines", "convergence", "growth"]],
     *,
     gains: Path = DEFAULT_GAINS,
     setpoint: Texts = (),
@@ -337,13 +337,14 @@ def study(
     tick: float | None = None,
     ticks: int | None = None,
     spacing: Texts = (),
+    latency: Path | None = None,
     jobs: int | None = None,
     out: Path | None = None,
     force: Flag = False,
     json: Flag = False,
     quiet: Flag = False,
 ) -> int:
-    """Study the closed loop on the exact arm: robustness, other controllers, refinement.
+    """Study the closed loop on the exact arm: robustness, other controllers, refinement; and how a chain grows.
 
     Args:
         name: What to study.
@@ -353,6 +354,7 @@ def study(
         tick: Period of a tick in seconds.
         ticks: Number of ticks of a simulation.
         spacing: Where the segments end; may be given several times where several are compared.
+        latency: JSON file with measured hops, {"hop_us": [...]}, for growth; default: it measures.
         jobs: Processes at once; default: one a processor.
         out: Directory for the facts (JSON) and the plot (PNG), made if missing.
         force: Write over existing files.
@@ -367,6 +369,7 @@ def study(
         "tick": None if tick is None else (tick,),
         "ticks": None if ticks is None else (ticks,),
         "spacing": spacing,
+        "latency": None if latency is None else (latency,),
         "jobs": None if jobs is None else (jobs,),
     }
     done = run_study(name, gains, choices, out, teller(silent=quiet or json), force=force)

@@ -22,7 +22,7 @@ from deploy.grid import MEASURED_STATES, Place, SegmentGrid, make_grid
 from deploy.held import Holder
 from deploy.semiseparable import NodeMatrices, multiply, realise
 from deploy.stability import SpectralRadius, longest_stable_tick, spectral_radius
-from deploy.step import Loop, Step, gain_rate, make_loop, make_step
+from deploy.step import Loop, gain_rate, make_loop, make_step
 from wire.artefact import Arm, GainsArtefact, Setpoint
 from wire.errors import OctarmError, UsageError
 from wire.factors import INPUTS, OUTPUTS, STATES, NodeFactors, SweepFactors
@@ -151,10 +151,10 @@ def deploy(
         scaled = step.whole()
         realisation = realise(scaled, OUTPUTS, INPUTS)
         worst = max(worst, _difference(realisation, scaled))
-        in_offset, out_offset = _offsets(artefact.arm, setpoint, grid)
+        in_offset, out_offset = offsets(artefact.arm, setpoint, grid)
         matrix = scaled * step.scale_in / step.scale_out[:, None]
         dense.append(DenseStep(matrix, in_offset.ravel(), out_offset.ravel()))
-        factors.append(_in_si(realisation, step, in_offset, out_offset))
+        factors.append(in_si(realisation, step.scale_in, step.scale_out, in_offset, out_offset))
     if not worst <= SWEEP_TOLERANCE:
         raise OctarmError(
             f"deployment on {grid.nodes} nodes, tick {tick_s:g} s: sweeps and dense matrix differ "
@@ -165,7 +165,7 @@ def deploy(
         faces_m=grid.faces_m,
         tick_s=float(tick_s),
         setpoint_names=tuple(setpoint.name for setpoint in artefact.setpoints),
-        nodes=tuple(_node(i, [f[i] for f in factors], grid) for i in range(grid.nodes)),
+        nodes=tuple(node_factors(i, [f[i] for f in factors], grid) for i in range(grid.nodes)),
         dense=tuple(dense),
         ranks_forward=tuple(tuple(f.forward_sent for f in one[:-1]) for one in factors),
         ranks_backward=tuple(tuple(f.backward_sent for f in one[1:]) for one in factors),
@@ -210,7 +210,7 @@ def _difference(realisation: Sequence[NodeMatrices], scaled: Array) -> float:
     return worst
 
 
-def _offsets(arm: Arm, setpoint: Setpoint, grid: SegmentGrid) -> tuple[Array, Array]:
+def offsets(arm: Arm, setpoint: Setpoint, grid: SegmentGrid) -> tuple[Array, Array]:
     """The setpoint as n commands hold it, as inputs (n, 7) and outputs (n, 5): x_e, feed-forward, y_e."""
     series = np.asarray(setpoint.curvature_per_m, dtype=np.float64)
     what = f"setpoint {setpoint.name}"
@@ -223,12 +223,19 @@ def _offsets(arm: Arm, setpoint: Setpoint, grid: SegmentGrid) -> tuple[Array, Ar
     return in_offset, in_offset[:, :OUTPUTS].copy()
 
 
-def _in_si(
-    realisation: Sequence[NodeMatrices], step: Step, in_offset: Array, out_offset: Array
+def in_si(
+    realisation: Sequence[NodeMatrices],
+    scale_in: Array,
+    scale_out: Array,
+    in_offset: Array,
+    out_offset: Array,
 ) -> list[SweepFactors]:
-    """Factors for inputs and outputs in SI; the sums stay in scaled units (sqrt of an energy)."""
-    inputs = step.scale_in.reshape(-1, INPUTS)
-    outputs = 1.0 / step.scale_out.reshape(-1, OUTPUTS, 1)
+    """Factors for inputs and outputs in SI; the sums stay in scaled units (sqrt of an energy).
+
+    Scales as in `deploy.step.Step`.
+    """
+    inputs = scale_in.reshape(-1, INPUTS)
+    outputs = 1.0 / scale_out.reshape(-1, OUTPUTS, 1)
     return [
         SweepFactors(
             D=outputs[i] * node.D * inputs[i],
@@ -245,7 +252,8 @@ def _in_si(
     ]
 
 
-def _node(index: int, factors: Sequence[SweepFactors], grid: SegmentGrid) -> NodeFactors:
+def node_factors(index: int, factors: Sequence[SweepFactors], grid: SegmentGrid) -> NodeFactors:
+    """One node's factors at all setpoints, sums padded to one length."""
     start = np.stack([one.out_offset for one in factors])
     return NodeFactors(
         index=index,

@@ -22,7 +22,7 @@ from design.solve_command import finite
 from wire.artefact import read_artefact
 from wire.errors import UsageError
 
-STUDIES = ("robustness", "baselines", "convergence")
+STUDIES = ("robustness", "baselines", "convergence", "growth")
 Progress = Callable[[str], None]
 Choices = Mapping[str, tuple[Any, ...] | None]
 """Per option what was given for it; None where nothing was."""

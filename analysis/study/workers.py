@@ -18,13 +18,17 @@ def call_all(
     arguments: Sequence[tuple[Any, ...]],
     jobs: int | None = None,
     done: Callable[[int], None] | None = None,
+    *,
+    fresh: bool = False,
 ) -> list[Result]:
     """`function(*a)` for each a; `jobs` processes at once, by default one a processor, 1 stays in this one.
+
+    `fresh` gives every call a new process, also with one job: its peak of memory is the call's own.
 
     `done` is told how many calls are finished. An exception of a call ends all and is raised here.
     """
     jobs = min(jobs or len(os.sched_getaffinity(0)), len(arguments))
-    if jobs <= 1:
+    if jobs <= 1 and not fresh:
         out = []
         for count, one in enumerate(arguments):
             out.append(function(*one))
@@ -32,7 +36,11 @@ def call_all(
                 done(count + 1)
         return out
     context = multiprocessing.get_context("spawn")
-    with _one_thread(), ProcessPoolExecutor(jobs, context) as pool:
+    calls = 1 if fresh else None
+    with (
+        _one_thread(),
+        ProcessPoolExecutor(max(1, jobs), context, max_tasks_per_child=calls) as pool,
+    ):
         futures = [pool.submit(function, *one) for one in arguments]
         try:
             for count, future in enumerate(as_completed(futures)):
