@@ -6,6 +6,7 @@ ends its workers and removes the group's directory.
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -32,6 +33,8 @@ def serve(parent: int, directory: str | None) -> int:
     child.install(reads_control=True)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     alive: dict[int, str] = {}
+    gc.collect()
+    gc.freeze()
     child.status("up")
     while not child.stopping:
         for line in child.wait_lines(None):

@@ -12,18 +12,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 from math import isfinite
+from struct import Struct
 from time import monotonic_ns
 from typing import Protocol
 
 import numpy as np
 
-from node.row import RowBlock, Y
-from node.sweep import Array, NodeSweep, Numbers
+from node.row import Batch, Y
+from node.sweep import Array, NodeSweep, Payload, bytes_of
 from wire.errors import UsageError
-from wire.factors import OUTPUTS, STATES
-from wire.messages import Reason, RejectedError
+from wire.messages import F8, Reason, RejectedError
 
-_total_output = np.ones(OUTPUTS).dot
+_ONE = Struct("<d")
 _OUTPUT = ("velocity_x", "velocity_y", "strain", "curvature", "command")
 
 
@@ -32,7 +32,10 @@ class NotFiniteError(Exception):
 
 
 class Outlet(Protocol):
-    """Where a block's results go: arrays that it fills, and a word when they are complete."""
+    """Where a block's results go: arrays that it fills, and a word when they are complete.
+
+    All of it must be there when the block is made.
+    """
 
     forward: Array
     """The sum to the tip's side; empty at the tip."""
@@ -87,7 +90,6 @@ class SegmentBlock:
         """When the last tick ended; 0 before the first has."""
         self.passed = 0
         """Sums that were handed on in memory."""
-        self._sweeps = tuple(sweeps)
         self._root, self._tip = sweeps[0], sweeps[-1]
         self._outlet = outlet
         self._epoch_ns = epoch_ns
@@ -99,16 +101,22 @@ class SegmentBlock:
             )
         self._inner = tuple(pairwise(sweeps))
         self._backward_inner = tuple((b, a) for a, b in reversed(self._inner))
-        self._own_measurement = tuple((s, slice(Y * i, Y * i + Y)) for i, s in enumerate(sweeps))
+        self._measuring = tuple((sweep, Y * i) for i, sweep in enumerate(sweeps))
+        self._unpack_y = Struct(f"<{Y * len(sweeps)}d").unpack
+        self._commands = bytes_of(outlet.commands)
         self._setpoints = frozenset(map(float, range(sweeps[0].setpoints)))
-        self._rows = tuple(_rows(sweep, batch) for sweep in sweeps)
+        self._finishing = tuple(
+            (sweep, Batch(sweep.row, batch), 8 * i) for i, sweep in enumerate(sweeps)
+        )
+        # looked up once: these are called in every tick
+        self._send_forward, self._send_backward = outlet.send_forward, outlet.send_backward
+        self._send_commands, self._begins = outlet.send_commands, outlet.begins
+        self._forward_out, self._backward_out = outlet.forward, outlet.backward
         self._batch, self._quota = batch, first_batch or batch
         self._total_forward = np.ones(outlet.forward.size).dot
         self._total_backward = np.ones(outlet.backward.size).dot
         self._filled = 0
         self._batch_began_ns = 0
-        for sweep, block in zip(sweeps, self._rows, strict=True):
-            sweep.start_in(block.rows[0])
         self._clear()
         outlet.begins(0, self.setpoint)
 
@@ -140,13 +148,15 @@ class SegmentBlock:
 
     # -- what comes -------------------------------------------------------------------------------
 
-    def on_measurement(self, values: Numbers, at_ns: int) -> None:
-        """Take y(k) of all segments; RejectedError if it is here already or not finite."""
+    def on_measurement(self, values: Payload, at_ns: int) -> None:
+        """Take y(k) of all segments, as bytes; RejectedError if it is here already or not finite."""
         if self._have_y:
             raise self._twice()
-        _check_finite("measurement", values)
-        for sweep, own in self._own_measurement:
-            sweep.input(values[own])
+        y = self._unpack_y(values)
+        if not isfinite(sum(y)):
+            _refuse_not_finite("measurement", y)
+        for sweep, at in self._measuring:
+            sweep.measured(y[at], y[at + 1])
         self._have_y, self._y_ns = True, at_ns
         self.began_ns = self.began_ns or at_ns
         if self._have_c:
@@ -156,13 +166,13 @@ class SegmentBlock:
             if self._have_c:
                 self._finish()
 
-    def on_forward(self, values: Numbers, at_ns: int) -> None:
+    def on_forward(self, values: Payload, at_ns: int) -> None:
         """Take c of the first segment from its neighbour; RejectedError as above."""
         if self._have_c:
             raise self._twice()
         if not self._have_y or self._tip.last:  # else the sum that goes on tells
             _check_finite("forward sum", values)
-        self._root.take_forward(values)
+        self._root.row.c[:] = values
         if self._have_y:
             self._forward()
         self._have_c, self._c_ns = True, at_ns
@@ -170,19 +180,20 @@ class SegmentBlock:
         if self._have_y and self._have_d:
             self._finish()
 
-    def on_backward(self, values: Numbers, at_ns: int) -> None:
+    def on_backward(self, values: Payload, at_ns: int) -> None:
         """Take d of the last segment from its neighbour; RejectedError as above, also for an announced setpoint
         that does not exist."""
         if self._have_d:
             raise self._twice()
-        if values[-1] not in self._setpoints:
+        (announced,) = _ONE.unpack_from(values, len(values) - 8)
+        if announced not in self._setpoints:
             raise RejectedError(
                 Reason.SETPOINT,
-                f"expected one of {len(self._setpoints)} setpoints, got {float(values[-1])!r}",
+                f"expected one of {len(self._setpoints)} setpoints, got {announced!r}",
             )
         if not self._have_y or self._root.first:
             _check_finite("backward sum", values)
-        self._tip.take_backward(values)
+        self._tip.row.d[:] = values
         if self._have_y:
             self._backward()
         self._have_d, self._d_ns = True, at_ns
@@ -193,8 +204,7 @@ class SegmentBlock:
     def skip_to(self, tick: int) -> None:
         """Nothing of this tick will come, the next is `tick`: the ticks between had no sweep."""
         self._hand_over(self.tick)
-        for sweep, block in zip(self._sweeps, self._rows, strict=True):
-            sweep.start_in(block.rows[0])
+        for sweep, _, _ in self._finishing:
             sweep.skip_to(tick)
         self.tick = tick
         self._clear()
@@ -209,12 +219,11 @@ class SegmentBlock:
             self.passed += 1
         last = self._tip
         if not last.last:
-            numbers = last.forward_sum()
+            last.forward_sum()
             # a product with ones is the quickest sum of a short array; what is not finite stays so in products
-            if not isfinite(self._total_forward(numbers)):
-                _refuse_not_finite("forward sum", self._root.row.c)
-                self._explain(numbers, "forward sum", last)
-            self._outlet.send_forward(self.tick, last.setpoint)
+            if not isfinite(self._total_forward(self._forward_out)):
+                self._explain(self._forward_out, "forward sum", self._root.row.c, last)
+            self._send_forward(self.tick, last.setpoint)
 
     def _backward(self) -> None:
         """The sums to the root's side, through all segments and on."""
@@ -223,40 +232,49 @@ class SegmentBlock:
             self.passed += 1
         first = self._root
         if not first.first:
-            numbers = first.backward_sum()
-            if not isfinite(self._total_backward(numbers)):
-                _refuse_not_finite("backward sum", self._tip.row.d)
-                self._explain(numbers, "backward sum", first)
-            self._outlet.send_backward(self.tick, first.setpoint)
+            first.backward_sum()
+            if not isfinite(self._total_backward(self._backward_out)):
+                self._explain(self._backward_out, "backward sum", self._tip.row.d, first)
+            self._send_backward(self.tick, first.setpoint)
 
     def _finish(self) -> None:
         """Commands of the next tick, records of this one, and the next tick begins."""
-        outlet, commands, sweeps = self._outlet, self._outlet.commands, self._sweeps
-        for i, sweep in enumerate(sweeps):
-            output = sweep.output()
-            if not isfinite(_total_output(output)):
-                self._explain(output, "estimate or command", sweep)
-            commands[i] = output[STATES]
-        outlet.send_commands(self.tick, self._root.next_setpoint)
-        sent_ns = monotonic_ns()
-        if self._epoch_ns is None:  # another machine's clock
-            self._epoch_ns = self._y_ns
+        for sweep, _, at in self._finishing:
+            deviation = sweep.finish()
+            if not isfinite(sum(deviation)):
+                self._explain(np.array(deviation), "estimate or command", b"", sweep)
+            _ONE.pack_into(self._commands, at, sweep.next_command)
+        self._send_commands(self.tick, self._root.next_setpoint)
+        self.ended_ns = sent_ns = monotonic_ns()
         epoch = self._epoch_ns
-        instants = [self._y_ns - epoch, self._c_ns - epoch, self._d_ns - epoch, sent_ns - epoch]
-        for sweep in sweeps:
-            _note(sweep, instants)
-        self.tick += 1
-        self.ended_ns = sent_ns
-        self._clear()
+        if epoch is None:  # another machine's clock
+            epoch = self._epoch_ns = self._y_ns
+        y, c, d, sent = (
+            self._y_ns - epoch,
+            self._c_ns - epoch,
+            self._d_ns - epoch,
+            sent_ns - epoch,
+        )
+        for sweep, batch, _ in self._finishing:
+            row = sweep.row
+            if sweep.first:
+                row.instants.pack_into(row.buffer, row.instants_at, y, d, sent)
+            elif sweep.last:
+                row.instants.pack_into(row.buffer, row.instants_at, y, c, sent)
+            else:
+                row.instants.pack_into(row.buffer, row.instants_at, y, c, d, sent)
+            batch.keep(sweep.reference)
+            sweep.advance()
         if not self._filled:
             self._batch_began_ns = sent_ns
         self._filled += 1
+        self.tick += 1
+        self._have_y = False
+        self._have_c, self._have_d = self._root.first, self._tip.last
+        self.began_ns = 0
         if self._filled >= self._quota or sent_ns - self._batch_began_ns > BATCH_NS:
             self._hand_over(self.tick)
-        at = self._filled
-        for sweep, block in zip(sweeps, self._rows, strict=True):
-            sweep.accept(sweep.last_output, block.rows[at])
-        outlet.begins(self.tick, self._root.setpoint)
+        self._begins(self.tick, self._root.setpoint)
 
     def flush(self) -> None:
         """Hand over the rows of all ticks that are done."""
@@ -266,7 +284,7 @@ class SegmentBlock:
     def _hand_over(self, next_tick: int) -> None:
         """Give a copy of the filled rows away, and fill them anew."""
         if self._filled:
-            rows = [block.telemetry(self._filled) for block in self._rows]
+            rows = [batch.take() for _, batch, _ in self._finishing]
             self._outlet.recorded(next_tick - self._filled, rows)
             self._filled, self._quota = 0, self._batch
 
@@ -275,8 +293,9 @@ class SegmentBlock:
     def _twice(self) -> RejectedError:
         return RejectedError(Reason.DUPLICATE, f"tick {self.tick} has it already")
 
-    def _explain(self, numbers: Array, field: str, sweep: NodeSweep) -> None:
-        """A total is not finite: fail for the number that is not, or it only overflowed."""
+    def _explain(self, numbers: Array, field: str, came: Payload, sweep: NodeSweep) -> None:
+        """A total is not finite: refuse what came, or fail for what was made of it; or it only overflowed."""
+        _check_finite(field, came)
         wrong = np.flatnonzero(~np.isfinite(numbers))
         if wrong.size:
             at = int(wrong[0])
@@ -297,26 +316,13 @@ def _check_chain(sweeps: Sequence[NodeSweep]) -> None:
             )
 
 
-def _rows(sweep: NodeSweep, batch: int) -> RowBlock:
-    instants = 2 + (not sweep.first) + (not sweep.last)
-    return RowBlock(batch, sweep.forward_received, sweep.backward_received, instants)
+def _check_finite(field: str, values: Payload) -> None:
+    numbers = np.frombuffer(values, F8).tolist()
+    if not isfinite(sum(numbers)):
+        _refuse_not_finite(field, numbers)
 
 
-def _note(sweep: NodeSweep, instants: list[int]) -> None:
-    row = sweep.row.instants
-    row[0], row[-1] = instants[0], instants[3]
-    if not sweep.first:
-        row[1] = instants[1]
-    if not sweep.last:
-        row[-2] = instants[2]
-
-
-def _check_finite(field: str, values: Numbers) -> None:
-    if not isfinite(sum(values)):
-        _refuse_not_finite(field, values)
-
-
-def _refuse_not_finite(field: str, values: Numbers) -> None:
+def _refuse_not_finite(field: str, values: Sequence[float]) -> None:
     for at, value in enumerate(values):
         if not isfinite(value):
-            raise RejectedError(Reason.NOT_FINITE, f"{field}[{at}] is {float(value)}")
+            raise RejectedError(Reason.NOT_FINITE, f"{field}[{at}] is {value}")

@@ -20,7 +20,7 @@ from typing import Any
 from node.block import NotFiniteError, SegmentBlock
 from node.row import Y
 from node.scheduling import Sectors
-from node.sweep import Array, NodeSweep, Numbers
+from node.sweep import Array, NodeSweep, payload
 from wire import session as zsession
 from wire.child import Child, Deadline
 from wire.counters import Flow, Rejections
@@ -28,6 +28,7 @@ from wire.errors import ExitCode
 from wire.factors import NodeFactors
 from wire.keys import Keys
 from wire.messages import (
+    HEADER_BYTES,
     PLANT,
     Incoming,
     Kind,
@@ -38,10 +39,9 @@ from wire.messages import (
     decode_stop,
     encode_batch,
     encode_counters,
-    numbers_of,
     run_tag,
 )
-from wire.placement import place
+from wire.placement import place, step_back
 from wire.reference import Reference
 from wire.run_config import NodeConfig, SegmentConfig
 
@@ -88,9 +88,13 @@ class NodeProcess:
             "forward": incoming(Kind.FORWARD_SUM, first.index - 1, first.forward_received),
             "backward": incoming(Kind.BACKWARD_SUM, last.index + 1, last.backward_received),
         }
+        self._all_incoming = tuple(self._incoming.values())
         self._publishers: dict[str, Any] = {}
         self._subscribers: list[Any] = []
         self._batches: deque[tuple[int, Sequence[Array]]] = deque()
+        self.send_forward = self._sender("forward")
+        self.send_backward = self._sender("backward")
+        self.send_commands = self._sender("command")
         self._block = SegmentBlock(
             sweeps,
             self,
@@ -99,10 +103,6 @@ class NodeProcess:
             first_batch=1 + (config.index * (config.batch_ticks - 1)) // config.nodes,
             epoch_ns=config.links.epoch_ns,
         )
-        # Bound once: looked up every tick.
-        self.send_forward = self._sender("forward")
-        self.send_backward = self._sender("backward")
-        self.send_commands = self._sender("command")
 
     def run(self) -> ExitCode:
         """Link up, take part in every tick, report, and leave; returns the exit code."""
@@ -113,6 +113,7 @@ class NodeProcess:
             self._declare(session)
             token = self._link(session)
             if token is not None:
+                step_back(config.links.fifo)
                 self._attend()
         finally:
             self._publishers.clear()
@@ -262,16 +263,18 @@ class NodeProcess:
 
     # -- Zenoh's thread ---------------------------------------------------------------------------
 
-    def _receiver(self, name: str, take: Callable[[Numbers, int], None]) -> Callable[[bytes], None]:
-        flow, incoming, lock = self._received[name], self._incoming[name], self._lock
-        due = incoming.due
+    def _receiver(self, name: str, take: Callable[[bytes, int], None]) -> Callable[[bytes], None]:
+        incoming, lock, note = self._incoming[name], self._lock, self._received[name].add
 
         def receive(raw: bytes) -> None:
             at_ns = monotonic_ns()
             try:
                 with lock:
-                    take(numbers_of(raw) if due(raw) else self._another(incoming, raw), at_ns)
-                flow.add(raw)
+                    if raw.startswith(incoming.header) and len(raw) == incoming.size:
+                        take(raw[HEADER_BYTES:], at_ns)
+                    else:
+                        take(self._another(incoming, raw), at_ns)
+                note(raw)
             except RejectedError as error:
                 self._rejections.add(error.reason)
             except NotFiniteError as error:
@@ -282,7 +285,7 @@ class NodeProcess:
 
         return receive
 
-    def _another(self, incoming: Incoming, raw: bytes) -> Numbers:
+    def _another(self, incoming: Incoming, raw: bytes) -> bytes:
         """A message that is not the one that is due: refused by name, unless a tick was left out."""
         message, block = incoming.decode(raw), self._block
         ahead = message.tick - block.tick
@@ -296,7 +299,7 @@ class NodeProcess:
             )
         if skips:
             block.skip_to(message.tick)
-        return message.values
+        return payload(message.values)
 
     def _fail(self, code: str, text: str) -> None:
         self._failure = self._failure or (code, text)
@@ -311,19 +314,19 @@ class NodeProcess:
         self._child.wake()
 
     def _sender(self, name: str) -> Callable[[int, int], None]:
-        flow, publishers, outgoing = self._sent[name], self._publishers, self._outgoing[name]
+        publishers, stamped = self._publishers, self._outgoing[name].stamped
+        note = self._sent[name].add
 
         def send(tick: int, setpoint: int) -> None:
-            raw = outgoing.stamped(tick, setpoint)
+            raw = stamped(tick, setpoint)
             publishers[name].put(raw)
-            flow.add(raw)
+            note(raw)
 
         return send
 
     def begins(self, tick: int, setpoint: int) -> None:
         """Know the messages of this tick beforehand."""
-        for incoming in self._incoming.values():
-            incoming.expect(tick, setpoint)
+        Incoming.expect_all(self._all_incoming, tick, setpoint)
 
     def recorded(self, tick: int, rows: Sequence[Array]) -> None:
         """Leave a batch to the main thread: nothing on the way of a tick waits for it."""

@@ -8,6 +8,7 @@ two pipes come from a start command, ssh for example, and are all that binds the
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -42,6 +43,9 @@ def serve(parent: int | None) -> int:
     child.install(reads_control=True)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     alive: dict[int, int] = {}
+    # What is loaded here stays as it is: a collection in a node would touch, and so copy, every page of it.
+    gc.collect()
+    gc.freeze()
     child.status("up")
     silence = Deadline(SILENCE_S)
     while not child.stopping:

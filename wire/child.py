@@ -22,6 +22,8 @@ from typing import Any
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_NAME = 15
+_SELECT_FILES = 1024
+"""`select` knows no file beyond this number."""
 LINE_LIMIT = 4000
 """Bytes of a status line: writes up to 4096 bytes (PIPE_BUF) by many processes never mix."""
 
@@ -115,7 +117,10 @@ class Child:
             watched = [self._read]
             if self._control >= 0 and not self.orphaned:
                 watched.append(self._control)
-            if select.select(watched, (), (), max(0, nanoseconds) * 1e-9)[0]:
+            seconds = max(0, nanoseconds) * 1e-9
+            if max(watched) >= _SELECT_FILES:  # then milliseconds must do
+                lines = self.wait_lines(seconds)
+            elif select.select(watched, (), (), seconds)[0]:
                 lines = self.wait_lines(0.0)
         return [json.loads(line) for line in lines]
 

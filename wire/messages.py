@@ -43,8 +43,7 @@ and the head of a byte string with its length as uint 16."""
 _MARKS = (0x97, 0xCF, 0xCF, 0xD2, 0xCD, 0xC5)
 _TICK_AT = 13
 _TICK = struct.Struct(">Q")
-_SETPOINT_AT = 27
-_SETPOINT = struct.Struct(">H")
+_TICK_TO_SETPOINT = struct.Struct(">QBiBH")
 HEADER_BYTES = _HEADER.size
 """Of a control message; its doubles follow, aligned."""
 MOST_NUMBERS = 0xFFFF // 8
@@ -149,14 +148,14 @@ class Outgoing:
     def __init__(self, kind: Kind, run: int, sender: int, numbers: int) -> None:
         if numbers > MOST_NUMBERS:
             raise ValueError(f"a message carries at most {MOST_NUMBERS} numbers, not {numbers}")
+        self._sender = sender
         self._raw = bytearray(_header(kind, run, 0, sender, 0, numbers) + bytes(8 * numbers))
         self.values: Array = np.frombuffer(self._raw, F8, offset=HEADER_BYTES)
 
     def stamped(self, tick: int, setpoint: int) -> bytes:
         """The whole message of this tick, with the values as they are now."""
         raw = self._raw
-        _TICK.pack_into(raw, _TICK_AT, tick)
-        _SETPOINT.pack_into(raw, _SETPOINT_AT, setpoint)
+        _TICK_TO_SETPOINT.pack_into(raw, _TICK_AT, tick, 0xD2, self._sender, 0xCD, setpoint)
         return bytes(raw)
 
 
@@ -181,12 +180,22 @@ class Incoming:
 
     def expect(self, tick: int, setpoint: int) -> None:
         """The message that is due now is that of this tick and setpoint."""
-        self._due = self._before_tick + _TICK.pack(tick) + self._after_tick[setpoint]
-        self._size = self._sizes[setpoint]
+        self.header = self._before_tick + _TICK.pack(tick) + self._after_tick[setpoint]
+        """What it must begin with."""
+        self.size = self._sizes[setpoint]
+        """How many bytes it must have."""
+
+    @staticmethod
+    def expect_all(several: Sequence[Incoming], tick: int, setpoint: int) -> None:
+        """The same for several kinds at once."""
+        stamp = _TICK.pack(tick)
+        for one in several:
+            one.header = one._before_tick + stamp + one._after_tick[setpoint]
+            one.size = one._sizes[setpoint]
 
     def due(self, raw: bytes) -> bool:
         """Whether these bytes are the message that is due; its numbers may still not be finite."""
-        return len(raw) == self._size and raw.startswith(self._due)
+        return len(raw) == self.size and raw.startswith(self.header)
 
     def decode(self, raw: bytes) -> Numbers:
         """Decode and check any message of this kind and sender; RejectedError as `decode_numbers`."""

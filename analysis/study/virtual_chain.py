@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from node.block import SegmentBlock
-from node.sweep import NodeSweep
+from node.sweep import NodeSweep, Payload, payload
 from wire.channels import MEASUREMENT
 from wire.errors import OctarmError
 from wire.factors import OUTPUTS, NodeFactors
@@ -161,7 +161,7 @@ class VirtualNode:
         self._sent: list[tuple[What, Array]] = []
         self._began = False
         self._block = SegmentBlock(self.sweeps, self)
-        self._handlers: tuple[Callable[[Array, int], None], ...] = (
+        self._handlers: tuple[Callable[[Payload, int], None], ...] = (
             self._block.on_measurement,
             self._block.on_forward,
             self._block.on_backward,
@@ -170,8 +170,9 @@ class VirtualNode:
     def take(self, what: What, values: Array) -> list[tuple[What, Array]]:
         """See `Member`."""
         self._sent = []
+        raw = payload(values)
         before = thread_time_ns()  # others' work on the machine does not count
-        self._handlers[what](values, 1)
+        self._handlers[what](raw, 1)
         self.handling_ns[what].append(thread_time_ns() - before)
         return self._sent
 
@@ -206,7 +207,7 @@ def virtual_nodes(factors: Sequence[NodeFactors], segments: int) -> list[Virtual
 
 def states(nodes: Sequence[VirtualNode]) -> Array:
     """Estimates and commands (n, 5) of the tick that begins."""
-    return np.stack([sweep.row.state.copy() for node in nodes for sweep in node.sweeps])
+    return np.stack([sweep.state for node in nodes for sweep in node.sweeps])
 
 
 def split(measurements: Array, nodes: Sequence[VirtualNode]) -> list[Array]:

@@ -246,9 +246,9 @@ def node_rows(
     rows: dict[int, list[float]] = {}
     for i, sweep in enumerate(sweeps):
         instants = 2 + (i > 0) + (i < n - 1)
-        row = sweep.row
-        parts = (row.x, row.schedule, row.c, row.d, wall.integers(0, 10**6, instants))
-        rows[i] = np.concatenate(parts).tolist()
+        row = sweep.row.now(sweep.reference)
+        row[-instants:] = wall.integers(0, 10**6, instants)
+        rows[i] = row.tolist()
         sweep.accept(sweep.output())
     return rows
 

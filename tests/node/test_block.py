@@ -22,7 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from node.block import NotFiniteError, SegmentBlock
-from node.sweep import NodeSweep, Numbers
+from node.sweep import NodeSweep, Numbers, payload
 from wire.channels import node_channels, width
 from wire.errors import UsageError
 from wire.messages import Reason, RejectedError
@@ -85,7 +85,7 @@ class Bench:
     # -- the other side
 
     def give(self, what: str, values: Numbers, at_ns: int = EPOCH_NS + 5) -> None:
-        getattr(self.block, f"on_{what}")(values, at_ns)
+        getattr(self.block, f"on_{what}")(payload(values), at_ns)
 
     def tick(self, given_now: dict[str, list[float]]) -> None:
         for what, values in given_now.items():
@@ -156,7 +156,7 @@ def test_numbers_are_those_of_the_equations() -> None:
     np.testing.assert_allclose(sent["command"], out[4:], rtol=1e-13)
     (row,) = bench.rows().tolist()
     assert row[:2] == now["measurement"]
-    assert row[2:7] == held
+    np.testing.assert_allclose(row[2:7], held, rtol=1e-15, atol=1e-15)
     assert row[7:9] == [0.0, 0.0]
     assert row[9:18] == [*now["forward"], *now["backward"]]
     assert row[18:21] == [2009 - EPOCH_NS, 2007 - EPOCH_NS, 2005 - EPOCH_NS]
@@ -508,7 +508,7 @@ def test_over_late_ticks_the_deviation_is_kept_and_the_command_held(
     assert bench.sent == sent
     assert (bench.block.tick, bench.block.begun) == (then, False)
     assert sum(len(rows[0]) for _, rows, _ in bench.batches) == at
-    assert [s.command for s in segments] == commands
+    np.testing.assert_allclose([s.command for s in segments], commands, rtol=0.0, atol=1e-14)
     for s, r, deviation in zip(segments, wanted, deviations, strict=True):
         np.testing.assert_allclose(s.estimate - r.at(then)[:4], deviation, rtol=0.0, atol=1e-13)
 
@@ -521,7 +521,7 @@ def test_over_late_ticks_the_deviation_is_kept_and_the_command_held(
         (row,) = rows[i]
         np.testing.assert_array_equal(row[:2], measurements(then, 2)[i])
         np.testing.assert_allclose(row[2:6] - r.at(then)[:4], deviations[i], rtol=0.0, atol=1e-13)
-        assert row[6] == commands[i]
+        assert row[6] == pytest.approx(commands[i], rel=0.0, abs=1e-14)
         assert row[7] == setpoint
 
 

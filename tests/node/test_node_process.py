@@ -235,7 +235,9 @@ def test_a_message_of_a_later_tick_leaves_out_those_between(paced: Bench) -> Non
 
 
 def raw_width(bench: Bench) -> int:
-    return int(bench.process._block._rows[0].telemetry(1).shape[1])
+    """Numbers of a telemetry row of the one segment."""
+    (sweep, _, _), *_ = bench.process._block._finishing
+    return len(sweep.row.now(sweep.reference))
 
 
 @pytest.mark.parametrize("what", list(INCOMING))

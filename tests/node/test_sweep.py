@@ -7,14 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from node.row import RowBlock
+from node.row import Batch
 from node.scheduling import Sectors
-from node.sweep import Array, NodeSweep, Numbers
+from node.sweep import Array, NodeSweep, Numbers, payload
 from wire.errors import OctarmError, UsageError
 from wire.factors import INPUTS, OUTPUTS, NodeFactors, SweepFactors
 from wire.reference import Leg, Reference
 
 BEND = 0.07
+ROUNDING = 1e-15
+"""A state is held as its deviation from the reference, of about its own size here."""
 SO_FAR = [0.3, 0.2, -0.1]
 """Angle and place that come with a forward sum."""
 
@@ -84,7 +86,7 @@ def test_products_are_those_of_the_matrices(
         state = [*sweep.estimate, sweep.command]
         z = factor_input(sweep, y) - f.in_offset
         x = sweep.input(y.tolist() if as_list else y)
-        np.testing.assert_array_equal(x, [*y, *state])
+        np.testing.assert_array_equal(x, [*state, *y])
         c_sent: Numbers = np.append(c, SO_FAR) if sizes[0] else c
         d_sent: Numbers = np.append(d, 0.0) if sizes[2] else d
         if as_list:
@@ -99,7 +101,6 @@ def test_products_are_those_of_the_matrices(
         np.testing.assert_allclose(
             out, f.D @ z + f.P @ c + f.U @ d + f.out_offset, rtol=1e-13, atol=1e-13
         )
-        np.testing.assert_array_equal(sweep.last_output, out)
         sweep.accept(out)
         np.testing.assert_array_equal(sweep.estimate, out[:4])
         assert sweep.command == out[4]
@@ -121,9 +122,9 @@ def test_the_order_of_the_three_changes_no_bit(sizes: tuple[int, int, int, int])
                 if what == "y":
                     sweep.input(y)
                 elif what == "c" and not sweep.first:
-                    sweep.take_forward(c)
+                    sweep.take_forward(payload(c))
                 elif what == "d" and not sweep.last:
-                    sweep.take_backward(d)
+                    sweep.take_backward(payload(d))
             if not sweep.last:
                 got += sweep.forward_sum().tobytes()
             if not sweep.first:
@@ -149,37 +150,36 @@ def test_products_use_their_own_arguments_only() -> None:
     expected = f.D @ z + f.P @ c + f.U @ d + f.out_offset
     out = tick_output(sweep, [0.3, -0.2], np.append(c, SO_FAR), np.append(d, 0.0))
     np.testing.assert_allclose(out, expected, rtol=1e-13, atol=1e-13)
-    np.testing.assert_array_equal(sweep.estimate, node.initial_estimate[0])
+    np.testing.assert_allclose(sweep.estimate, node.initial_estimate[0], rtol=ROUNDING)
 
 
 def test_what_a_tick_knows_is_in_its_row() -> None:
     sweep = NodeSweep(random_node(23, [(2, 3, 4, 5)]))
-    row = sweep.row
-    state = row.state.copy()
-    out = tick_output(sweep, [0.3, -0.2], [1.0, 2.0, *SO_FAR], [3.0, 4.0, 5.0, 6.0, 0.0])
+    state = sweep.state
+    c, d = [1.0, 2.0, *SO_FAR], [3.0, 4.0, 5.0, 6.0, 0.0]
+    out = tick_output(sweep, [0.3, -0.2], c, d)
+    row = sweep.row.now(sweep.reference)
+    np.testing.assert_array_equal(row[:-4], [0.3, -0.2, *state, 0.0, 0.0, *c, *d])
     sweep.accept(out)
-    np.testing.assert_array_equal(row.x, [0.3, -0.2, *state])
-    np.testing.assert_array_equal(row.schedule, [0.0, 0.0])
-    np.testing.assert_array_equal(row.c, [1.0, 2.0, *SO_FAR])
-    np.testing.assert_array_equal(row.d, [3.0, 4.0, 5.0, 6.0, 0.0])
-    assert sweep.row is not row
-    np.testing.assert_array_equal(sweep.row.state, out)
+    np.testing.assert_allclose(sweep.state, out, rtol=1e-15, atol=1e-15)
 
 
-def test_a_tick_goes_on_in_any_row_with_the_same_numbers() -> None:
-    results = []
-    for elsewhere in (False, True):
-        sweep = NodeSweep(random_node(24, [(2, 3, 4, 5)]))
-        rows = RowBlock(3, sweep.forward_received, sweep.backward_received, 4).rows
-        if elsewhere:
-            sweep.start_in(rows[0])
-        got = []
-        for tick in range(3):
-            c, d = [0.1 * tick, 0.2, *SO_FAR], [0.3, 0.4, 0.5, 0.6, 0.0]
-            got.append(tick_output(sweep, [0.1, 0.2], c, d))
-            sweep.accept(got[-1], rows[tick + 1] if elsewhere and tick < 2 else None)
-        results.append(np.stack(got))
-    np.testing.assert_array_equal(results[0], results[1])
+def test_a_batch_keeps_rows_as_they_were_with_absolute_states() -> None:
+    node = random_node(24, [(2, 3, 4, 5)])
+    coefficients = np.random.default_rng(17).standard_normal((4, 7, 3))
+    for reference in (None, Reference(0.1, [Leg(0.0, 0.3, coefficients)])):
+        sweep = NodeSweep(node, reference=reference)
+        batch = Batch(sweep.row, 4)
+        for rounds in range(2):
+            states = []
+            for _ in range(3):
+                tick_output(sweep, [0.1, 0.2], [0.1, 0.2, *SO_FAR], [0.3, 0.4, 0.5, 0.6, 0.0])
+                states.append(sweep.state)
+                batch.keep(sweep.reference)
+                sweep.accept(0.1 * sweep.output())
+            rows = batch.take()
+            assert rows.shape == (3, 9 + 5 + 5 + 4), rounds
+            np.testing.assert_array_equal(rows[:, 2:7], states)
 
 
 def test_sums_are_written_where_they_are_sent_from() -> None:
@@ -197,8 +197,8 @@ def test_sums_are_written_where_they_are_sent_from() -> None:
 def test_starts_at_the_setpoint_it_is_told() -> None:
     node = random_node(7, [(2, 3, 4, 5), (2, 3, 4, 5)])
     sweep = NodeSweep(node, setpoint=1)
-    np.testing.assert_array_equal(sweep.estimate, node.initial_estimate[1])
-    assert sweep.command == node.initial_command[1]
+    np.testing.assert_allclose(sweep.estimate, node.initial_estimate[1], rtol=ROUNDING)
+    assert sweep.command == pytest.approx(node.initial_command[1], rel=ROUNDING)
     assert (sweep.forward_received, sweep.backward_received) == (2 + 3, 4 + 1)
 
 
@@ -224,8 +224,6 @@ def test_a_sum_of_the_wrong_length_is_refused(count: int) -> None:
         sweep.forward([0.0] * count)
     with pytest.raises(OctarmError, match=rf"node 3: backward sum of {count} numbers, expected 3"):
         sweep.backward([0.0] * count)
-    with pytest.raises(OctarmError, match="forward sum"):
-        sweep.take_forward([0.0] * count)
 
 
 @pytest.mark.parametrize("setpoint", [-1, 2])
@@ -238,16 +236,13 @@ def test_nothing_is_allocated_between_ticks() -> None:
     sweep = NodeSweep(random_node(11, [(2, 3, 4, 5)]))
     c_next = sweep.forward([1.0, 2.0, *SO_FAR])
     d_previous = sweep.backward([1.0, 1.0, 1.0, 1.0, 0.0])
-    out, rows = sweep.output(), {id(sweep.row)}
+    row = sweep.row
     for _ in range(4):
-        x = sweep.input([0.0, 0.0])
-        assert x is sweep.row.x
+        sweep.input([0.0, 0.0])
         assert sweep.forward([0.0] * 5) is c_next
         assert sweep.backward([0.0] * 5) is d_previous
-        assert sweep.output() is out
-        sweep.accept(out)
-        rows.add(id(sweep.row))
-    assert len(rows) == 2
+        sweep.accept(sweep.output())
+        assert sweep.row is row
 
 
 def test_a_change_of_gains_is_announced_then_taken_and_leaves_no_jump() -> None:
@@ -335,7 +330,7 @@ def test_over_ticks_without_a_sweep_the_deviation_is_kept_and_the_command_held(
     sweep.skip_to(then)
     assert sweep.tick == then
     np.testing.assert_allclose(sweep.estimate - reference.at(then)[:4], deviation, atol=1e-12)
-    assert sweep.command == command
+    assert sweep.command == pytest.approx(command, rel=0.0, abs=10.0 * ROUNDING)
     f = node.setpoints[0]
     z = factor_input(sweep, [0.4, -0.6]) - reference_input(reference.at(then))
     expected = f.D @ z + f.P @ c[:2] + f.U @ d[:4] + reference.at(then + 1)[:5]
