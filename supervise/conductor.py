@@ -146,11 +146,11 @@ class Conductor:
             hand = plan.by_hand.intersection(host.indices)
             if hand and not host.local:
                 self._view.note(explain(plan, host))
-            for index in host.indices:
-                if index in hand:
-                    self._view.note(offer(plan, plan.nodes[index]))
-                elif zygote is not None:
-                    zygote.tell(dumps(plan.nodes[index]))
+            for node in plan.nodes:
+                if node.index in hand:
+                    self._view.note(offer(plan, node))
+                elif node.index in host.indices and zygote is not None:
+                    zygote.tell(dumps(node))
 
     def _start(self, name: str, room: str, *arguments: str) -> Process:
         process = Process(name, module(room, *arguments), self._log)

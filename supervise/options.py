@@ -104,6 +104,16 @@ class RunOptions:
                     raise UsageError(
                         f"{name}: with --hosts the hosts file says where processes meet; leave it out"
                     )
+            self._whole_processes(self.placed_on)
+
+    def _whole_processes(self, hosts: Hosts) -> None:
+        """A process is on one host."""
+        for host in hosts.hosts:
+            if host.first % self.segments_per_process:
+                raise UsageError(
+                    f"--segments-per-process {self.segments_per_process}: host {host.name} begins with segment "
+                    f"{host.first}, in the middle of a process; give each host a multiple of it"
+                )
 
     @cached_property
     def placed(self) -> str | tuple[float, ...]:

@@ -236,7 +236,9 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         endpoints=endpoints,
         directory=directory,
         hosts=hosts,
-        by_hand=frozenset(options.by_hand).union(*(h.indices for h in hosts if h.by_hand)),
+        by_hand=frozenset(options.by_hand).union(
+            i for host in hosts if host.by_hand for i in run.firsts if i in host.indices
+        ),
         start_timeout_s=options.start_timeout_s,
     )
 

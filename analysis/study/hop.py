@@ -10,6 +10,7 @@ import json
 import multiprocessing
 import os
 import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -27,6 +28,7 @@ from wire.session import control_publisher, direct, matched, open_session
 Array = npt.NDArray[np.float64]
 
 SAMPLES = 5000
+BENCH_SAMPLES = 1001
 WARM_UP = 500
 BYTES = 200
 """About a message of the shipped gains."""
@@ -51,10 +53,13 @@ class Hop:
 def hop_of_file(path: Path) -> Hop:
     """From JSON {"hop_us": [samples], "cpu_us": number}; without cpu_us a hop is all processor time.
 
-    UsageError if the file cannot be read or does not hold positive numbers.
+    Or from the bench.json of `octarm bench`, see `_of_bench`. UsageError if the file cannot be read or does not
+    hold positive numbers.
     """
     try:
         found = json.loads(path.read_text())
+        if "rows" in found:
+            found = _of_bench(found["rows"])
         samples = np.asarray(found["hop_us"], dtype=np.float64)
         cpu = found.get("cpu_us")
         cpu = None if cpu is None else float(cpu)
@@ -71,6 +76,29 @@ def hop_of_file(path: Path) -> Hop:
     if not 0.0 < cpu < np.inf:
         raise UsageError(f"--latency {path}: cpu_us: expected a positive number, got {cpu!r}")
     return Hop(samples, samples, cpu, str(path))
+
+
+def _of_bench(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Hops and processor time of the longest chain of real nodes in a benchmark.
+
+    A hop is the chain's time over its links, its distribution that of the chain's percentiles; the processor
+    time of a tick is shared by its 2 (n - 1) sums, n measurements and n commands. KeyError without such a
+    chain.
+    """
+    chains = [row for row in rows if row["pattern"] == "neighbour" and row.get("chain_us")]
+    if not chains:
+        raise KeyError("rows: no neighbour row with chain_us")
+    row = max(chains, key=lambda one: int(one["nodes"]))
+    links = int(row["nodes"]) - 1
+    chain = row["chain_us"]
+    shares = np.linspace(0.0, 1.0, BENCH_SAMPLES)
+    known = [0.0, 0.5, 0.95, 0.99, 0.999, 1.0]
+    at = [chain["p50"], *(chain[name] for name in ("p50", "p95", "p99", "p99_9", "max"))]
+    messages = 2 * links + 2 * (links + 1)
+    return {
+        "hop_us": np.interp(shares, known, np.array(at) / links).tolist(),
+        "cpu_us": row["cpu_us_per_tick"] / messages,
+    }
 
 
 def measure_hop(samples: int = SAMPLES) -> Hop:

@@ -438,7 +438,8 @@ def test_scalar_signals_come_first() -> None:
 def test_state_is_orthonormal() -> None:
     pde = beam(0.1, (w(), 1.0), disturbances=W)
     system = discretise(pde, 35)
-    assert system.state.T @ system.state == pytest.approx(np.eye(70), abs=1e-12)
+    # rounding of 70 functions up to degree 34: 1.04e-12 with the slowest of OpenBLAS's kernels
+    assert system.state.T @ system.state == pytest.approx(np.eye(70), abs=1e-11)
     # a uniform force enters v and not k, as `force` and as a disturbance
     uniform = sampled_gain(
         system, np.zeros((0, 1)), lambda s: np.stack([np.ones_like(s), 0.0 * s])[:, None]

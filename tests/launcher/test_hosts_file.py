@@ -150,3 +150,15 @@ def test_numbered_addresses_of_the_new_kind() -> None:
     host = Host("a", "fd00::1", 0, 2, start=("ssh", "a"), base_port=17_000)
     chosen = over_hosts(Hosts(Path("hosts.toml"), "127.0.0.1", None, (host,)))
     assert chosen.nodes == ["tcp/[fd00::1]:17000"]
+
+
+def test_a_process_of_several_segments_is_on_one_host(tmp_path: Path) -> None:
+    file = tmp_path / "hosts.toml"
+    file.write_text(
+        '[plant]\naddress = "127.0.0.1"\n'
+        '[[hosts]]\nname = "root"\naddress = "127.0.0.1"\nnodes = 3\n'
+        '[[hosts]]\nname = "tip"\naddress = "127.0.0.1"\nnodes = 3\n'
+    )
+    assert RunOptions(nodes=6, hosts=file, segments_per_process=3).placed_on is not None
+    with pytest.raises(UsageError, match="host tip begins with segment 3, in the middle of a"):
+        RunOptions(nodes=6, hosts=file, segments_per_process=2)

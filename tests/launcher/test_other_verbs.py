@@ -87,7 +87,8 @@ def test_help_names_verbs_and_options(start: Start) -> None:
 
 def test_the_command_line_has_the_defaults_of_the_options() -> None:
     names = {"tick": "tick_s", "start_timeout": "start_timeout_s", "deadline": "deadline_s"}
-    own = {"json", "no_plot", "quiet", "no_pin"}
+    names["period"] = "period_s"
+    own = {"json", "no_plot", "quiet", "no_pin", "sched"}
     options = RunOptions()
     for name, parameter in inspect.signature(launcher.run).parameters.items():
         if name not in own:
