@@ -34,7 +34,6 @@ def main() -> int:
 def _drive(parent: int, directory: str | None) -> int:
     from bench.configs import DriverConfig
     from bench.driver import Driver
-    from bench.zygote import leave
 
     die_with_parent(parent)
     name_process("octarm-driver")
@@ -53,7 +52,7 @@ def _drive(parent: int, directory: str | None) -> int:
         child.status("failed", code="internal", message=f"driver: {error!r}")
         return int(ExitCode.INTERNAL)
     finally:
-        leave(child, endpoints)
+        child.leave(endpoints)
 
 
 if __name__ == "__main__":

@@ -33,6 +33,9 @@ class ZenohLinks:
         self._keys = Keys(run_tag(config.run_id))
         self.command = Tally()
         self._count = len(config.ports)
+        # A real node gives counters of each of its segments.
+        several = config.pattern == "neighbour"
+        self._segments = {port.index: port.commanded for port in config.ports if several}
         self._ends = () if config.ends is None else (0, config.ends.last)
         self._left = 0
         self._complete_ns = 0
@@ -56,8 +59,9 @@ class ZenohLinks:
                 zsession.control_publisher(session, keys.measurement(port.index))
             )
         for member in config.members:
+            last_words = OTHER_QUEUE + self._segments.get(member, 1)
             queue = (
-                zsession.queue(END_QUEUE) if member in self._ends else zsession.newest(OTHER_QUEUE)
+                zsession.queue(END_QUEUE) if member in self._ends else zsession.newest(last_words)
             )
             self._records[member] = session.declare_subscriber(keys.telemetry(member), queue)
         self._stop = zsession.control_publisher(session, keys.stop)
@@ -142,7 +146,7 @@ class ZenohLinks:
         self._stop.put(stop)
         out: list[bytes] = []
         limit = Deadline(limit_s)
-        missing = set(self._config.members)
+        missing = {member: self._segments.get(member, 1) for member in self._config.members}
         while missing and not limit.passed and not self._child.stopping:
             for member in tuple(missing):
                 while (sample := self._records[member].try_recv()) is not None:
@@ -151,7 +155,9 @@ class ZenohLinks:
                     if last or member in self._ends:
                         out.append(raw)
                     if last:
-                        missing.discard(member)
+                        missing[member] -= 1
+                if not missing[member]:
+                    del missing[member]
             sleep(COLLECT_S)
         return out
 

@@ -16,12 +16,11 @@ import traceback
 from bench.configs import WorkerConfig
 from bench.raw import run_raw
 from bench.worker import Worker
-from wire.child import Child, Deadline, die_with_parent, name_process, send_status
+from wire.child import Child, die_with_parent, name_process, send_status
 from wire.errors import ExitCode, OctarmError
 from wire.run_config import loads
 
 GRACE_S = 1.0
-LIFELINE_S = 0.5
 
 
 def serve(parent: int, directory: str | None) -> int:
@@ -42,20 +41,8 @@ def serve(parent: int, directory: str | None) -> int:
                 _birth(line, child, alive)
         _reap(child, alive)
     _end(child, alive)
-    leave(child, [])
+    child.leave([])
     return 0
-
-
-def leave(child: Child, endpoints: list[str]) -> None:
-    """Remove the sockets; the group's directory too if the launcher is gone.
-
-    The launcher closes the lifeline before it asks for the end. When it is killed, the signal of its
-    death can come a little before the lifeline's end.
-    """
-    limit = Deadline(LIFELINE_S)
-    while not (child.orphaned or limit.passed):
-        child.wait_lines(limit.left)
-    child.leave(endpoints)
 
 
 def _birth(line: bytes, child: Child, alive: dict[int, str]) -> None:

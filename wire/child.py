@@ -28,8 +28,14 @@ LINE_LIMIT = 4000
 """Bytes of a status line: writes up to 4096 bytes (PIPE_BUF) by many processes never mix."""
 
 
+_parent: int | None = None
+"""Who started this process, where that matters."""
+
+
 def die_with_parent(parent: int) -> None:
     """Ask the kernel for SIGTERM when the parent dies; ends at once if it is dead already."""
+    global _parent  # noqa: PLW0603 - of this process, as the kernel has it
+    _parent = parent
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
     if os.getppid() != parent:
         raise SystemExit(0)
@@ -177,6 +183,8 @@ class Child:
     def leave(self, endpoints: list[str]) -> None:
         """Remove this process's sockets, and the whole private directory if the launcher is
         dead."""
+        # The signal of its death can come before the lifeline's end does.
+        self.orphaned = self.orphaned or (_parent is not None and os.getppid() != _parent)
         remove_sockets(endpoints)
         if self.orphaned and self.directory is not None:
             shutil.rmtree(self.directory, ignore_errors=True)

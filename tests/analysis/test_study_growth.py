@@ -46,6 +46,25 @@ ONE = Hosts("one host", 1)
 APART = Hosts("apart", 0)
 
 
+def test_hops_of_a_benchmark_are_those_of_its_longest_chain(tmp_path: Path) -> None:
+    file = tmp_path / "bench.json"
+    chain = {"p50": 90.0, "p95": 180.0, "p99": 270.0, "p99_9": 360.0, "max": 450.0}
+    rows = [
+        {"pattern": "bare", "nodes": 50, "chain_us": chain, "cpu_us_per_tick": 1.0},
+        {"pattern": "neighbour", "nodes": 5, "chain_us": chain, "cpu_us_per_tick": 1.0},
+        {"pattern": "neighbour", "nodes": 10, "chain_us": chain, "cpu_us_per_tick": 760.0},
+    ]
+    file.write_text(json.dumps({"rows": rows}))
+    hop = hop_of_file(file)
+    assert hop.cpu_us == pytest.approx(760.0 / (18 + 20))
+    assert np.median(hop.same_core_us) == pytest.approx(10.0)
+    assert np.max(hop.same_core_us) == pytest.approx(50.0)
+    assert np.percentile(hop.same_core_us, 95.0) == pytest.approx(20.0)
+    file.write_text(json.dumps({"rows": rows[:1]}))
+    with pytest.raises(UsageError, match="neighbour row with chain_us"):
+        hop_of_file(file)
+
+
 def constant(processes: int, service_ns: int, latency_ns: int) -> Durations:
     return Durations(np.full((processes, 3), service_ns), np.full((processes - 1, 2), latency_ns))
 

@@ -107,3 +107,44 @@ def test_a_process_that_gets_no_core_goes_on_where_it_was() -> None:
     own, _, (note,) = _placed("1000")
     assert own == allowed
     assert note.startswith("not pinned to core 1000: ")
+
+
+STEP_BACK = """
+import json, os, threading
+from wire.placement import place, step_back
+notes, seen = [], {}
+place(None, 10, notes.append)
+ready, stop = threading.Event(), threading.Event()
+
+def other():
+    seen["other"] = [os.sched_getscheduler(0), os.sched_getparam(0).sched_priority]
+    seen["other nice"] = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    ready.set()
+    stop.wait()
+    seen["other later"] = [os.sched_getscheduler(0), os.sched_getparam(0).sched_priority]
+
+thread = threading.Thread(target=other)
+thread.start()
+ready.wait()
+step_back(10)
+stop.set()
+thread.join()
+seen["main"] = [os.sched_getscheduler(0), os.sched_getparam(0).sched_priority]
+seen["main nice"] = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+seen["noted"] = bool(notes)
+print(json.dumps(seen))
+"""
+
+
+def test_a_main_thread_that_steps_back_is_behind_the_threads_that_were_there() -> None:
+    end = subprocess.run(
+        [sys.executable, "-c", STEP_BACK], check=True, capture_output=True, text=True
+    )
+    seen = json.loads(end.stdout)
+    assert seen["other"] == seen["other later"]
+    if seen["noted"]:  # no real-time scheduling here: it is nicer
+        assert seen["main nice"] > seen["other nice"]
+    else:
+        assert seen["other"] == [os.SCHED_FIFO, 10]
+        assert seen["main"][0] == os.SCHED_FIFO
+        assert 0 < seen["main"][1] < 10
