@@ -321,8 +321,8 @@ class Group:
                     f"worker {index}", line["pid"], parent=self._zygote.pid
                 )
             case "died":
-                who = line.get("who", f"node {line.get('node')}")
-                self._failures.append(f"{who} {ending(line['code'])}")
+                kind = "node" if self.pattern == "neighbour" else "worker"
+                self._failures.append(f"{kind} {line['node']} {ending(line['code'])}")
             case "failed":
                 self._failures.append(line["message"])
             case "note":
