@@ -321,7 +321,7 @@ class Group:
                     f"worker {index}", line["pid"], parent=self._zygote.pid
                 )
             case "died":
-                kind = "node" if self.pattern == "neighbour" else "worker"
+                kind = "node" if self.pattern == "neighbour" else self.pattern
                 self._failures.append(f"{kind} {line['node']} {ending(line['code'])}")
             case "failed":
                 self._failures.append(line["message"])

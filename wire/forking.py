@@ -1,7 +1,7 @@
 """Processes forked from one that has its modules loaded: birth, death and end, of nodes and benchmark workers.
 
-The process that forks (`node.zygote`, `bench.zygote`) reads configurations from the launcher, one a line; births
-and deaths go back as status lines.
+The process that forks (`node.zygote`, `bench.zygote`) reads configurations from the launcher, one a line;
+births and deaths go back as status lines.
 """
 
 from __future__ import annotations
