@@ -8,6 +8,7 @@ so that a killed recorder loses no more than that.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from os import sched_yield
 from pathlib import Path
 from time import monotonic
 
@@ -76,6 +77,8 @@ class RecordingWriter:
             for channel, fields, begin, end in slices:
                 message = dict(zip(fields, (tick, time_s, *row[begin:end]), strict=True))
                 add(channel, log_time, _encode(message), log_time, tick)
+            # A node that wakes up on this core would wait for the rest of a time slice, some ms; many ticks long.
+            sched_yield()
 
     def event(self, tick: int, level: str, name: str, message: str) -> None:
         """Write one line of the run's story."""
