@@ -207,12 +207,14 @@ def _realtime(recording: Recording) -> dict[str, Any] | None:
     pace = recording.configuration.pace
     if pace is None:
         return None
-    late = np.concatenate([[False], recording.late, [False]])
+    # All of it: late ticks at the end have no row of the nodes, so that `recording.late` ends before them.
+    recorded = np.asarray(recording.table("/plant/pace").column("late")) > 0.0
+    late = np.concatenate([[False], recorded, [False]])
     edges = np.flatnonzero(np.diff(late.astype(np.int8)))
     return {
         "period_s": pace.period_s,
         "hold_ticks": pace.hold_ticks,
-        "late_ticks": recording.counter("late_ticks") or int(np.count_nonzero(recording.late)),
+        "late_ticks": int(np.count_nonzero(recorded)),
         "longest_hold_ticks": int(np.max(edges[1::2] - edges[::2], initial=0)),
     }
 

@@ -77,7 +77,7 @@ class RecordingWriter:
             for channel, fields, begin, end in slices:
                 message = dict(zip(fields, (tick, time_s, *row[begin:end]), strict=True))
                 add(channel, log_time, _encode(message), log_time, tick)
-            # A node that wakes up on this core would wait for the rest of a time slice, some ms; many ticks long.
+            # A node that wakes up on this core would wait for the rest of a time slice: some ms, some ticks.
             sched_yield()
 
     def event(self, tick: int, level: str, name: str, message: str) -> None:

@@ -67,7 +67,7 @@ def hop_of_file(path: Path) -> Hop:
         raise UsageError(f"--latency {path}: {error.strerror or error}") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UsageError(
-            f'--latency {path}: expected JSON {{"hop_us": [microseconds, ...]}}, got {error!r}'
+            f'--latency {path}: expected JSON {{"hop_us": [microseconds, ...]}} or a bench.json: {error}'
         ) from None
     if samples.ndim != 1 or not samples.size or not (np.isfinite(samples) & (samples > 0.0)).all():
         raise UsageError(f"--latency {path}: hop_us: expected a list of positive numbers, in us")
