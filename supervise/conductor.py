@@ -60,6 +60,7 @@ class Conductor:
         self._plant: Process | None = None
         self._recorder: Process | None = None
         self._state = RunState(plan)
+        self._noted: set[str] = set()
         self._interrupts = 0
         self._leaving = False
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
@@ -342,7 +343,8 @@ class Conductor:
                 self._view.errors(line["tip_error_m"], line["estimation_error"])
             case "stopped" if line["from"] == "plant":
                 self._view.progress(line["tick"])
-            case "note":
+            case "note" if line["text"] not in self._noted:  # n nodes have it to say
+                self._noted.add(line["text"])
                 self._view.note(f"{line['from']}: {line['text']}")
 
     def _order(self, process: Process | None, **message: Any) -> None:

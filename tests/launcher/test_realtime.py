@@ -120,6 +120,7 @@ def test_real_time_scheduling_is_used_where_it_is_permitted_and_said_where_not(
     urgent = {name for name, policy in policies.items() if policy == os.SCHED_FIFO}
     if "no real-time scheduling" in cli.err:
         assert urgent == set()
+        assert cli.err.count("no real-time scheduling") == 1
     else:
         assert urgent == {"octarm-node0", "octarm-node1", "octarm-node2", "octarm-plant"}
 
