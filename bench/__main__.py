@@ -8,11 +8,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
 import sys
-import traceback
 
-from wire.child import Child, die_with_parent, name_process
-from wire.errors import ExitCode, OctarmError
-from wire.run_config import loads
+from wire.serving import serve_child
 
 
 def main() -> int:
@@ -35,24 +32,9 @@ def _drive(parent: int, directory: str | None) -> int:
     from bench.configs import DriverConfig
     from bench.driver import Driver
 
-    die_with_parent(parent)
-    name_process("octarm-driver")
-    child = Child("driver", control=0, status=1, directory=directory)
-    child.install(reads_control=True)
-    endpoints: list[str] = []
-    try:
-        config = loads(DriverConfig, child.configuration(), "driver configuration")
-        endpoints = list(config.links.listen)
-        return int(Driver(config, child).run())
-    except OctarmError as error:
-        child.status("failed", code="configuration", message=str(error))
-        return int(error.exit_code)
-    except Exception as error:
-        traceback.print_exc()
-        child.status("failed", code="internal", message=f"driver: {error!r}")
-        return int(ExitCode.INTERNAL)
-    finally:
-        child.leave(endpoints)
+    return serve_child(
+        "driver", parent, DriverConfig, lambda c, child: Driver(c, child).run(), directory=directory
+    )
 
 
 if __name__ == "__main__":
