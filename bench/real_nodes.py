@@ -16,11 +16,8 @@ from supervise.endpoints import Endpoints
 from supervise.options import MOST_TICKS, RunOptions
 from supervise.plan import Prepared, make_plan, prepare
 from wire.factors import NodeFactors
-from wire.messages import PLANT, Kind, encode_numbers, run_tag
+from wire.messages import message_bytes
 from wire.run_config import NodeConfig
-
-LATE_TICK = 1000
-"""Sizes are those of messages with a tick number of two bytes, as almost all have."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +37,6 @@ class RealNodes:
     payload_bytes: int
     """Mean size of a sum's message."""
     command_bytes: int
-    measurement_bytes: int
 
     @property
     def processes(self) -> int:
@@ -55,19 +51,9 @@ def deploy_nodes(gains: Path, nodes: int, per_process: int = 1) -> RealNodes:
     )
     setpoint = prepared.artefact.setpoint_index(prepared.course.setpoint)
     factors = prepared.deployment.nodes
-    run = run_tag("size")
-
-    def size(kind: Kind, sender: int, numbers: int) -> int:
-        return len(encode_numbers(kind, run, LATE_TICK, sender, setpoint, [0.5] * numbers))
-
     groups = [range(i, min(i + per_process, nodes)) for i in range(0, nodes, per_process)]
-    sums = [
-        size(Kind.FORWARD_SUM, own[0] - 1, factors[own[0]].forward_received) for own in groups[1:]
-    ]
-    sums += [
-        size(Kind.BACKWARD_SUM, own[-1] + 1, factors[own[-1]].backward_received)
-        for own in groups[:-1]
-    ]
+    sums = [message_bytes(factors[own[0]].forward_received) for own in groups[1:]]
+    sums += [message_bytes(factors[own[-1]].backward_received) for own in groups[:-1]]
     measured = [f.setpoints[setpoint].in_offset[-Y:].tolist() for f in factors]
     return RealNodes(
         prepared=prepared,
@@ -84,8 +70,7 @@ def deploy_nodes(gains: Path, nodes: int, per_process: int = 1) -> RealNodes:
             arrived=-2,
         ),
         payload_bytes=round(sum(sums) / len(sums)),
-        command_bytes=size(Kind.COMMAND, 0, per_process),
-        measurement_bytes=size(Kind.MEASUREMENT, PLANT, Y * per_process),
+        command_bytes=message_bytes(per_process),
     )
 
 

@@ -68,18 +68,9 @@ class ZenohLinks:
         for publisher in self._publishers:
             wake = zsession.observe(lambda _: self._child.wake())
             self._keep.append(publisher.declare_matching_listener(wake))
-        presence = zsession.observe(self._presence)
         self._keep.append(
-            session.liveliness().declare_subscriber(keys.all_ready, presence, history=True)
+            zsession.watch_tokens(session, keys.all_ready, self._present, self._child.wake)
         )
-
-    def _presence(self, sample: Any) -> None:
-        index = int(str(sample.key_expr).rsplit("/", 1)[1])
-        if zsession.is_put(sample):
-            self._present.add(index)
-        else:
-            self._present.discard(index)
-        self._child.wake()
 
     def link(self) -> bool:
         """Wait until every member's token and every link is there; False if stopped before."""

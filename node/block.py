@@ -269,9 +269,7 @@ class SegmentBlock:
             self._batch_began_ns = sent_ns
         self._filled += 1
         self.tick += 1
-        self._have_y = False
-        self._have_c, self._have_d = self._root.first, self._tip.last
-        self.began_ns = 0
+        self._clear()
         if self._filled >= self._quota or sent_ns - self._batch_began_ns > BATCH_NS:
             self._hand_over(self.tick)
         self._begins(self.tick, self._root.setpoint)

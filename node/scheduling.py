@@ -41,10 +41,6 @@ class ArmEnd(NamedTuple):
     x_m: float
     y_m: float
 
-    def grown(self, turn_rad: float, stretch: float, chord_x_m: float, chord_y_m: float) -> ArmEnd:
-        """With one segment more, see `grow`."""
-        return ArmEnd(*grow(self, turn_rad, stretch, chord_x_m, chord_y_m))
-
 
 CLAMP = ArmEnd(0.0, 0.0, 0.0)
 """Where the arm begins."""

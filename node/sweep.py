@@ -21,7 +21,6 @@ far, d with the setpoint of the next tick.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, isfinite, sin
 from struct import Struct
 
 import numpy as np
@@ -217,15 +216,9 @@ class NodeSweep:
 
     def forward_sum(self) -> memoryview:
         """W c + Q (in - in_ref) and the arm with this segment; also in `forward_out`."""
-        row, out = self.row, self._forward_bytes
-        self._active.forward(row.of_forward, self._c_sum)
-        turn, x, y = CLAMP if self.first else _END.unpack_from(row.c, self._so_far_at)
-        turn += self._turn
-        if isfinite(turn):  # as `node.scheduling.grow`
-            cosine, sine = self._stretch * cos(turn), self._stretch * sin(turn)
-            x = x + cosine * self._chord_x - sine * self._chord_y
-            y = y + sine * self._chord_x + cosine * self._chord_y
-        _END.pack_into(out, self._end_at, turn, x, y)
+        out = self._forward_bytes
+        self._active.forward(self.row.of_forward, self._c_sum)
+        _END.pack_into(out, self._end_at, *self._end())
         return out
 
     def backward_sum(self) -> memoryview:

@@ -116,18 +116,8 @@ class PlantProcess:
                 publisher.declare_matching_listener(zsession.observe(lambda _: self._child.wake()))
             )
         self._keep.append(
-            session.liveliness().declare_subscriber(
-                keys.all_ready, zsession.observe(self._presence), history=True
-            )
+            zsession.watch_tokens(session, keys.all_ready, self._present, self._child.wake)
         )
-
-    def _presence(self, sample: Any) -> None:
-        index = int(str(sample.key_expr).rsplit("/", 1)[1])
-        if zsession.is_put(sample):
-            self._present.add(index)
-        else:
-            self._present.discard(index)
-        self._child.wake()
 
     def _link(self) -> bool:
         """Wait for every node's token, every link and the launcher's start; False if stopped

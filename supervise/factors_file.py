@@ -12,7 +12,7 @@ import json
 from typing import Any
 
 from deploy import Deployment, NodeFactors
-from wire.messages import Kind, encode_numbers, run_tag
+from wire.messages import message_bytes
 
 
 def readable(factors: NodeFactors) -> dict[str, Any]:
@@ -43,12 +43,6 @@ def factors_json(deployment: Deployment) -> str:
             "nodes": [readable(factors) for factors in deployment.nodes],
         }
     )
-
-
-def message_bytes(numbers: int, tick: int = 1000, node: int = 50) -> int:
-    """Bytes of an encoded sum with that many numbers, at a typical tick and node."""
-    raw = encode_numbers(Kind.FORWARD_SUM, run_tag("typical"), tick, node, 0, [0.1] * numbers)
-    return len(raw)
 
 
 def facts(deployment: Deployment) -> dict[str, Any]:

@@ -130,6 +130,11 @@ def _header(kind: Kind, run: int, tick: int, sender: int, setpoint: int, numbers
     )
 
 
+def message_bytes(numbers: int) -> int:
+    """Bytes of a control message that carries so many doubles."""
+    return HEADER_BYTES + 8 * numbers
+
+
 def encode_numbers(
     kind: Kind, run: int, tick: int, sender: int, setpoint: int, values: Sequence[float]
 ) -> bytes:
@@ -175,15 +180,16 @@ class Incoming:
         ]
         self._before_tick = headers[0][:_TICK_AT]
         self._after_tick = [header[_TICK_AT + _TICK.size :] for header in headers]
-        self._sizes = [HEADER_BYTES + 8 * numbers for numbers in lengths]
+        self._sizes = list(map(message_bytes, lengths))
+        self.header = b""
+        """What the message that is due must begin with."""
+        self.size = 0
+        """How many bytes it must have."""
         self.expect(0, 0)
 
     def expect(self, tick: int, setpoint: int) -> None:
         """The message that is due now is that of this tick and setpoint."""
-        self.header = self._before_tick + _TICK.pack(tick) + self._after_tick[setpoint]
-        """What it must begin with."""
-        self.size = self._sizes[setpoint]
-        """How many bytes it must have."""
+        Incoming.expect_all((self,), tick, setpoint)
 
     @staticmethod
     def expect_all(several: Sequence[Incoming], tick: int, setpoint: int) -> None:

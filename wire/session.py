@@ -197,6 +197,23 @@ def matched(publisher: Any) -> bool:
     return bool(publisher.matching_status.matching)
 
 
+def watch_tokens(session: Any, key: str, present: set[int], wake: Callable[[], None]) -> Any:
+    """Keep `present` the numbers that liveliness tokens of this key end in; returns what must be kept alive.
+
+    `wake` is called, on Zenoh's thread, when one appears or vanishes.
+    """
+
+    def notice(sample: Any) -> None:
+        index = int(str(sample.key_expr).rsplit("/", 1)[1])
+        if is_put(sample):
+            present.add(index)
+        else:
+            present.discard(index)
+        wake()
+
+    return session.liveliness().declare_subscriber(key, observe(notice), history=True)
+
+
 def is_put(sample: Any) -> bool:
     """Whether a liveliness sample says that a token appeared (else it vanished)."""
     return bool(sample.kind == zenoh.SampleKind.PUT)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from node.scheduling import CLAMP, ArmEnd, Sectors
+from node.scheduling import CLAMP, ArmEnd, Sectors, grow
 from wire.run_config import SchedulingConfig
 
 THREE = Sectors.of(SchedulingConfig((2, 0, 1), (30.0, 60.0), 2.0, 3.0))
@@ -67,7 +67,7 @@ def test_the_arm_grows_segment_by_segment_as_turned_and_stretched_chords() -> No
     chords = random.standard_normal((5, 2))
     end = CLAMP
     for turn, stretch, (x, y) in zip(turns, stretches, chords, strict=True):
-        end = end.grown(float(turn), float(stretch), float(x), float(y))
+        end = ArmEnd(*grow(end, float(turn), float(stretch), float(x), float(y)))
     whole = np.cumsum(turns)
     expected = sum(
         stretches[i] * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) @ chords[i]
@@ -81,6 +81,6 @@ def test_an_arm_that_bends_as_a_whole_is_seen_where_it_is() -> None:
     n, bend = 40, 1.2
     end = CLAMP
     for i in range(n):
-        end = end.grown(bend * (0.5 if i == 0 else 1.0) / n, 1.0, 1.0 / n, 0.0)
+        end = ArmEnd(*grow(end, bend * (0.5 if i == 0 else 1.0) / n, 1.0, 1.0 / n, 0.0))
     assert end.x_m == pytest.approx(np.sin(bend) / bend, abs=1e-3)
     assert end.y_m == pytest.approx((1.0 - np.cos(bend)) / bend, abs=1e-3)
