@@ -14,6 +14,7 @@ import tyro
 
 from supervise.entry import serve, show_json, teller
 from supervise.options import RunOptions
+from supervise.recording_verbs import animate
 from supervise.shipped import DEFAULT_ARM, DEFAULT_GAINS
 from wire.errors import ExitCode, UsageError
 
@@ -294,38 +295,6 @@ def doctor(*, json: Flag = False) -> int:
     else:
         print(report(checks))
     return int(ExitCode.OK if well else ExitCode.INTERNAL)
-
-
-def animate(
-    recording: tyro.conf.Positional[Path],
-    *,
-    out: Path | None = None,
-    fps: float = 15.0,
-    speed: float | None = None,
-    width: int = 480,
-    force: Flag = False,
-    json: Flag = False,
-    quiet: Flag = False,
-) -> int:
-    """Make a GIF of a run: true and estimated arm, reference and active setpoint over time.
-
-    Args:
-        recording: The recording, or the run's directory that holds it.
-        out: GIF to write, default arm.gif beside the recording.
-        fps: Frames a second of the film.
-        speed: Seconds of the arm's time in a second of the film; default: the film lasts 10 s.
-        width: Of the film in pixels.
-        force: Write over an existing file.
-        json: Print one JSON object instead of a line.
-        quiet: No progress.
-    """
-    from analysis.animate import Film, film_line
-    from analysis.animate import animate as make_film
-
-    progress = teller(silent=quiet or json)
-    facts = make_film(recording, out, Film(fps, speed, width), progress, force=force)
-    show_json(facts) if json else print(film_line(facts))
-    return int(ExitCode.OK)
 
 
 def study(

@@ -25,10 +25,10 @@ from wire.artefact import GainsArtefact, parse_artefact
 from wire.channels import (
     COMMAND,
     EVENTS,
-    FORMAT_VERSION,
     MEASUREMENT,
     METADATA,
     PACE,
+    READABLE,
     SHAPE,
     SHAPE_POINTS,
     STATE,
@@ -265,10 +265,10 @@ def read_recording(path: Path) -> Recording:
     if facts is None:
         raise UsageError(f"recording {path}: {_not_ours(content)}")
     version = facts.get("format_version", "")
-    if version != str(FORMAT_VERSION):
+    if version not in map(str, READABLE):
         raise UsageError(
-            f"recording {path}: expected format version {FORMAT_VERSION}, got {version or 'none'}; "
-            "read it with the octarm that wrote it, or a newer one"
+            f"recording {path}: expected format version {' or '.join(map(str, READABLE))}, got "
+            f"{version or 'none'}; read it with the octarm that wrote it, or a newer one"
         )
     if "run" not in facts:
         raise UsageError(f"recording {path}: no run configuration in its metadata; it was edited")

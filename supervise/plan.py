@@ -22,13 +22,12 @@ import msgspec
 from deploy import Deployment, SegmentGrid, deploy
 from deploy.path import References, make_references
 from supervise.endpoints import Endpoints
-from supervise.factors_file import factors_json
 from supervise.hosts import Host, this_machine
 from supervise.options import RunOptions
 from supervise.scenario import Course, settle
 from supervise.spacing import spacing_name
 from wire.artefact import GainsArtefact, digest, read_artefact
-from wire.channels import FORMAT_VERSION
+from wire.channels import FORMAT_VERSION, NODES_ATTACHMENT
 from wire.errors import UsageError
 from wire.placement import FIFO_PRIORITY
 from wire.run_config import (
@@ -204,9 +203,10 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             ),
         )
 
+    configs = tuple(node(i) for i in run.firsts)
     return Plan(
         run=run,
-        nodes=tuple(node(i) for i in run.firsts),
+        nodes=configs,
         plant=PlantConfig(
             run=run,
             arm=msgspec.to_builtins(artefact.arm),
@@ -229,7 +229,7 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             attachments={
                 "gains.json": options.gains.read_text(),
                 "run.json": dumps(run),
-                "deployment.json": factors_json(deployment),
+                NODES_ATTACHMENT: f"[{','.join(map(dumps, configs))}]",
             },
             links=links([], [endpoints.plant]),
         ),

@@ -14,7 +14,12 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
+READABLE = (3, 4)
+"""Versions that this octarm reads; others are refused by name."""
+NODES_ATTACHMENT = "nodes.json"
+"""Attached since version 4: a JSON list of the configurations (wire.run_config.NodeConfig) that the node
+processes got, with matrices and references bit for bit."""
 SHAPE_POINTS = 33
 """Points along the arm in /plant/shape, equally spaced in arclength, root and tip included."""
 METADATA = "octarm"

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from closed_form import artefact
 
 from deploy import Deployment, SegmentGrid, deploy
-from deploy.path import make_references
+from deploy.path import References, make_references
 from node.scheduling import Sectors
 from node.sweep import NodeSweep
 from plant.disturbance import DisturbanceSpec
@@ -28,15 +28,25 @@ from plant.model import ArmPlant, PlantParameters
 from plant.noise import SensorNoise
 from recorder.writer import RecordingWriter
 from wire.artefact import GainsArtefact, write_artefact
-from wire.channels import FORMAT_VERSION, SHAPE_POINTS, label, node_channels, plant_channels
+from wire.channels import (
+    FORMAT_VERSION,
+    NODES_ATTACHMENT,
+    SHAPE_POINTS,
+    label,
+    node_channels,
+    plant_channels,
+)
 from wire.messages import PLANT
 from wire.run_config import (
     DisturbanceConfig,
     LegConfig,
+    LinkConfig,
+    NodeConfig,
     NoiseConfig,
     PaceConfig,
     RunConfig,
     SchedulingConfig,
+    SegmentConfig,
     dumps,
 )
 
@@ -125,6 +135,27 @@ def run_config(
     )
 
 
+def node_configs(
+    run: RunConfig, deployment: Deployment, references: References
+) -> list[NodeConfig]:
+    """What each node process would have got."""
+    links = LinkConfig((), (), None, deadline_s=5.0, epoch_ns=0, cpu=None, fifo=None)
+    return [
+        NodeConfig(
+            run_id=run.run_id,
+            index=i,
+            nodes=run.nodes,
+            setpoint=run.setpoint_index,
+            scheduling=run.scheduling,
+            batch_ticks=32,
+            skip_ticks=0 if run.pace is None else run.pace.hold_ticks + 1,
+            links=links,
+            segments=(SegmentConfig(node.to_plain(), references.nodes[i].to_plain()),),
+        )
+        for i, node in enumerate(deployment.nodes)
+    ]
+
+
 def write_recording(
     path: Path,
     scenario: Scenario = Scenario(),
@@ -146,19 +177,6 @@ def write_recording(
         for i, node in enumerate(deployment.nodes)
     }
     layout[PLANT] = plant_channels(n)
-    growing = path.with_suffix(".growing")
-    writer = RecordingWriter(growing, run.tick_s, layout, flush_s=math.inf)
-    writer.head(
-        {
-            "format_version": str(FORMAT_VERSION),
-            "run": dumps(run),
-            "artefact_sha256": sha256,
-            "seed": str(run.seed),
-            "versions": json.dumps({"octarm": "test"}),
-            "epoch_ns": "0",
-        },
-        {"gains.json": attached.read_text()},
-    )
     setpoint = artefact.setpoints[index]
     plant = ArmPlant(
         PlantParameters(
@@ -178,6 +196,22 @@ def write_recording(
         run.setpoint,
         run.first_hold_s,
         run.legs,
+    )
+    growing = path.with_suffix(".growing")
+    writer = RecordingWriter(growing, run.tick_s, layout, flush_s=math.inf)
+    writer.head(
+        {
+            "format_version": str(FORMAT_VERSION),
+            "run": dumps(run),
+            "artefact_sha256": sha256,
+            "seed": str(run.seed),
+            "versions": json.dumps({"octarm": "test"}),
+            "epoch_ns": "0",
+        },
+        {
+            "gains.json": attached.read_text(),
+            NODES_ATTACHMENT: f"[{','.join(map(dumps, node_configs(run, deployment, references)))}]",
+        },
     )
     sweeps = [
         NodeSweep(

@@ -103,7 +103,7 @@ def test_the_recording_is_an_ordinary_mcap_file(start: Start) -> None:
         attached = {a.name for a in reader.iter_attachments()}
     assert times == sorted(times)
     assert names == {"octarm", "summary"}
-    assert attached == {"gains.json", "run.json", "deployment.json"}
+    assert attached == {"gains.json", "run.json", "nodes.json"}
     assert {"/node/00/backward_sum", "/node/02/forward_sum", "/plant/shape", "/event"} <= topics
     assert "/node/00/forward_sum" not in topics
     assert "/node/02/backward_sum" not in topics

@@ -1,0 +1,47 @@
+"""The verbs of the command line that look at recordings, one function each.
+
+Part of launcher.py in a file of its own; what a verb does lives in `analysis` and `supervise`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tyro
+
+from supervise.entry import show_json, teller
+from wire.errors import ExitCode
+
+Flag = tyro.conf.FlagCreatePairsOff[bool]
+
+
+def animate(
+    recording: tyro.conf.Positional[Path],
+    *,
+    out: Path | None = None,
+    fps: float = 15.0,
+    speed: float | None = None,
+    width: int = 480,
+    force: Flag = False,
+    json: Flag = False,
+    quiet: Flag = False,
+) -> int:
+    """Make a GIF of a run: true and estimated arm, reference and active setpoint over time.
+
+    Args:
+        recording: The recording, or the run's directory that holds it.
+        out: GIF to write, default arm.gif beside the recording.
+        fps: Frames a second of the film.
+        speed: Seconds of the arm's time in a second of the film; default: the film lasts 10 s.
+        width: Of the film in pixels.
+        force: Write over an existing file.
+        json: Print one JSON object instead of a line.
+        quiet: No progress.
+    """
+    from analysis.animate import Film, film_line
+    from analysis.animate import animate as make_film
+
+    progress = teller(silent=quiet or json)
+    facts = make_film(recording, out, Film(fps, speed, width), progress, force=force)
+    show_json(facts) if json else print(film_line(facts))
+    return int(ExitCode.OK)
