@@ -20,8 +20,9 @@ import numpy.typing as npt
 from analysis.metrics import energy_norm
 from analysis.recording import QUANTITIES, Recording
 from deploy import Place, SegmentGrid
-from node.scheduling import ArmEnd, Sectors
+from node.scheduling import Sectors
 from wire.errors import UsageError
+from wire.joints import ArmEnd
 
 Array = npt.NDArray[np.float64]
 

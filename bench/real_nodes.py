@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bench.configs import PATIENCE_S, EndRows, Port
-from node.row import OWN, Y
+from node.row import Y
 from supervise.endpoints import Endpoints
 from supervise.options import MOST_TICKS, RunOptions
 from supervise.plan import Prepared, make_plan, prepare
 from wire.factors import NodeFactors
+from wire.joints import SUMS_AT
 from wire.messages import message_bytes
 from wire.run_config import NodeConfig
 
@@ -76,7 +77,7 @@ def deploy_nodes(gains: Path, nodes: int, per_process: int = 1) -> RealNodes:
 
 def _row(factors: NodeFactors) -> int:
     """Columns of an end node's telemetry row: its numbers, the sums, and three instants."""
-    return OWN + factors.forward_received + factors.backward_received + 3
+    return SUMS_AT + factors.forward_received + factors.backward_received + 3
 
 
 def node_configs(

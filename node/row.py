@@ -13,14 +13,12 @@ from struct import Struct
 import numpy as np
 import numpy.typing as npt
 
-from wire.channels import COMMAND, MEASUREMENT, SCHEDULE, STATE
+from wire.channels import MEASUREMENT, SCHEDULE
 from wire.factors import BACKWARD_EXTRA, FORWARD_EXTRA, INPUTS, OUTPUTS
 
 Array = npt.NDArray[np.float64]
 
 Y = len(MEASUREMENT)
-OWN = Y + len(STATE) + len(COMMAND) + len(SCHEDULE)
-"""Numbers of a telemetry row before the sums."""
 Y_PAIR = Struct("<2d")
 KNOWN = Struct("<4d")
 """The measurement as it came, and the schedule."""

@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from node.row import KNOWN, Y_PAIR, TickRow, matrix
-from node.scheduling import CLAMP, ArmEnd, Sectors, grow
+from node.scheduling import Sectors
 from wire.errors import OctarmError, UsageError
 from wire.factors import (
     BACKWARD_EXTRA,
@@ -37,6 +37,7 @@ from wire.factors import (
     NodeFactors,
     SweepFactors,
 )
+from wire.joints import CLAMP, ArmEnd, grow
 from wire.messages import F8
 from wire.reference import TERMS, Leg, Reference
 

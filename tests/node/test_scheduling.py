@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from node.scheduling import CLAMP, ArmEnd, Sectors, grow
+from node.scheduling import Sectors
+from wire.joints import CLAMP, ArmEnd, grow
 from wire.run_config import SchedulingConfig
 
 THREE = Sectors.of(SchedulingConfig((2, 0, 1), (30.0, 60.0), 2.0, 3.0))
