@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from wire.errors import UsageError
+from wire.joints import TipConfig
 
 T = TypeVar("T")
 
@@ -277,6 +278,7 @@ class RecorderConfig:
     """Numbers in the forward sum that each node receives (0 at the root)."""
     backward_widths: tuple[int, ...]
     """Numbers in the backward sum that each node receives (0 at the tip)."""
+    tip: TipConfig
     flush_s: float
     """A killed run loses at most this much wall-clock time of its recording."""
     metadata: dict[str, str]
