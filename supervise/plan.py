@@ -26,7 +26,7 @@ from supervise.origin import git_revision, machine_facts, versions
 from supervise.scenario import Course, settle
 from supervise.spacing import spacing_name
 from wire.artefact import GainsArtefact, digest, read_artefact
-from wire.channels import FORMAT_VERSION, NODES_ATTACHMENT
+from wire.channels import FLUSH_S, FORMAT_VERSION, NODES_ATTACHMENT
 from wire.errors import UsageError
 from wire.joints import TipConfig
 from wire.placement import FIFO_PRIORITY
@@ -43,7 +43,6 @@ from wire.run_config import (
 )
 
 BATCH_TICKS = 32
-FLUSH_S = 0.5
 CORES = 2
 """Two sweeps run towards each other; more cores would only add wake-ups across cores (runtime
 figures)."""
