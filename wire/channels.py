@@ -21,8 +21,9 @@ NODES_ATTACHMENT = "nodes.json"
 """Attached since version 4: a JSON list of the configurations (wire.run_config.NodeConfig) that the node
 processes got, with matrices and references bit for bit."""
 LOSS_S = 0.5
-"""A run that is killed loses no more of its recording than this, or the tick that it was in: rows wait `BATCH_NS`
-at most with their sender, and `FLUSH_S` in the recorder, and there is room for the way between the two."""
+"""A run that is killed loses no more of its recording than this, or the tick that it was in.
+
+Rows wait `BATCH_NS` at most with their sender and `FLUSH_S` in the recorder; the rest is for the way between."""
 BATCH_NS = 150_000_000
 """Rows do not wait longer than this for a batch to fill, while ticks go on."""
 FLUSH_S = 0.2
