@@ -35,7 +35,7 @@ class Table:
     @property
     def rows(self) -> int:
         """Number of messages."""
-        return self.column("tick").size if self.columns else 0
+        return next((column.size for column in self.columns.values()), 0)
 
     @property
     def ticks(self) -> Ints:

@@ -45,3 +45,30 @@ def animate(
     facts = make_film(recording, out, Film(fps, speed, width), progress, force=force)
     show_json(facts) if json else print(film_line(facts))
     return int(ExitCode.OK)
+
+
+def diff(
+    a: tyro.conf.Positional[Path],
+    b: tyro.conf.Positional[Path],
+    *,
+    tolerance: float | None = None,
+    all: Flag = False,
+    json: Flag = False,
+    quiet: Flag = False,
+) -> int:
+    """Are two recordings the same run bit for bit, and if not, where and how far apart? Exit code 3 if not.
+
+    Args:
+        a: A recording, or the run's directory that holds it.
+        b: Another one.
+        tolerance: Differences up to this share of a field's largest magnitude count as none, 1e-9 for example.
+        all: Show every field of every channel, also where nothing differs, and every key.
+        json: Print one JSON object instead of tables.
+        quiet: No progress.
+    """
+    from analysis.diff import diff as compare
+    from analysis.diff_table import diff_table
+
+    facts = compare(a, b, tolerance, teller(silent=quiet or json))
+    show_json(facts) if json else print(diff_table(facts, everything=all))
+    return int(ExitCode.OK if facts["same"] else ExitCode.DEGRADED)
