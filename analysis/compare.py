@@ -101,13 +101,13 @@ def compare(one: Recording, other: Recording, tolerance: float = 0.0) -> Compari
 
 def last_tick(recording: Recording) -> int:
     """The last tick that is in a recording, -1 if there is none; of a cut one the last complete one."""
-    if recording.unfinished is not None:
-        return recording.ticks - 1
     last = [
-        int(table.ticks.max())
+        int(table.ticks.max()) if table.rows else -1
         for topic, table in recording.tables.items()
-        if topic != EVENTS.topic and table.rows and "tick" in table.columns
+        if topic not in (EVENTS.topic, *DRAWN) and (not table.rows or "tick" in table.columns)
     ]
+    if recording.unfinished is not None:
+        return min(last, default=-1)
     return max(last, default=-1)
 
 

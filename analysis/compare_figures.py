@@ -6,6 +6,7 @@ are never the same, are here as percentiles.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy.typing as npt
 from analysis.recording import Recording
 from analysis.summary import summary_of
 from wire.channels import label
+from wire.errors import UsageError
 
 Array = npt.NDArray[np.float64]
 
@@ -33,28 +35,41 @@ _FIGURES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 """Name, unit and where in the summary."""
 
 
-def figures(one: Recording, other: Recording) -> list[dict[str, Any]]:
+def figures(
+    one: Recording, other: Recording, progress: Callable[[str], None]
+) -> list[dict[str, Any]]:
     """The figures of both runs with their ratio; null where a recording does not hold one."""
-    columns = [_figures_of(recording) for recording in (one, other)]
+    columns = [_figures_of(recording, progress) for recording in (one, other)]
     return [
         {"figure": name, "unit": unit, "a": a, "b": b, "ratio": _ratio(a, b)}
         for (name, unit, a), (_, _, b) in zip(*columns, strict=True)
     ]
 
 
-def _figures_of(recording: Recording) -> list[tuple[str, str, float | None]]:
-    summary: dict[str, Any] = summary_of(recording) if recording.ticks else {}
+def _figures_of(
+    recording: Recording, progress: Callable[[str], None]
+) -> list[tuple[str, str, float | None]]:
+    summary: dict[str, Any] = {}
+    try:
+        summary = summary_of(recording)
+    except (
+        UsageError
+    ) as error:  # no tick is complete, or a channel is missing: the rest is compared
+        progress(f"no figures: {error}")
     out: list[tuple[str, str, float | None]] = [("ticks", "", recording.ticks)]
     for name, unit, keys in _FIGURES:
         value: Any = summary
         for key in keys:
             value = (value or {}).get(key)
         out.append((name, unit, value))
-    late = np.asarray(recording.table("/plant/pace").numbers("late")) if recording.ticks else None
-    out.append(("late ticks", "", None if late is None else int(np.count_nonzero(late > 0.0))))
+    late = _values(recording, "/plant/pace", "late")
+    out.append(("late ticks", "", int(np.count_nonzero(late > 0.0)) if late.size else None))
     for name, values in (
         ("node, measurement to command", _spans_ms(recording)),
-        ("the arm's own integration", _advance_ms(recording)),
+        (
+            "the arm's own integration",
+            1e-6 * _values(recording, "/sweep/timing", "advance_wall_ns"),
+        ),
     ):
         known = values[np.isfinite(values)]
         for share in (50, 99):
@@ -65,15 +80,25 @@ def _figures_of(recording: Recording) -> list[tuple[str, str, float | None]]:
 
 def _spans_ms(recording: Recording) -> Array:
     """From the arrival of its measurement to its command, every node and tick, wall clock."""
-    names = ("measurement_received_wall_ns", "command_sent_wall_ns")
     topics = [f"/node/{label(i, recording.nodes)}/timing" for i in range(recording.nodes)]
-    instants = [recording.table(t).by_tick(names, recording.ticks) for t in topics]
-    return np.concatenate([1e-6 * (one[:, 1] - one[:, 0]) for one in instants])
+    return (
+        np.concatenate(
+            [
+                _values(recording, topic, "command_sent_wall_ns")
+                - _values(recording, topic, "measurement_received_wall_ns")
+                for topic in topics
+            ]
+        )
+        * 1e-6
+    )
 
 
-def _advance_ms(recording: Recording) -> Array:
-    table = recording.table("/sweep/timing")
-    return 1e-6 * table.by_tick(("advance_wall_ns",), recording.ticks)[:, 0]
+def _values(recording: Recording, topic: str, field: str) -> Array:
+    """The field's values, none if it is not in the recording."""
+    table = recording.tables.get(topic)
+    if table is None or field not in table.columns:
+        return np.zeros(0)
+    return table.numbers(field)
 
 
 def _ratio(a: float | None, b: float | None) -> float | None:

@@ -70,7 +70,7 @@ def diff(
         "channels_only_in_b": list(found.missing_a),
         "channels_not_compared": list(found.left_out),
         "order": None if found.order is None else dataclasses.asdict(found.order),
-        "figures": figures(one, other),
+        "figures": figures(one, other, progress),
     }
 
 
