@@ -6,6 +6,7 @@ channels' values; configuration and versions are `analysis.compare_facts`', the 
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,6 +89,9 @@ def compare(one: Recording, other: Recording, tolerance: float = 0.0) -> Compari
         pairs[topic] = pair(a, b, ticks_s)
         if topic == EVENTS.topic and ends[0] != ends[1] and end is not None:
             pairs[topic] = _until(pairs[topic], end)
+        if ends[0] != ends[1] and "tick" not in a.columns:  # nobody knows what is beyond the end
+            nothing = np.zeros(0, dtype=np.int64)
+            pairs[topic] = dataclasses.replace(pairs[topic], only_a=nothing, only_b=nothing)
         gathered.setdefault(kind_of(topic)[0], []).append(Part(topic, pairs[topic], a, b, number))
     return Comparison(
         kinds=tuple(compare_kind(name, parts, end, tolerance) for name, parts in gathered.items()),
@@ -133,14 +137,7 @@ def _comparable(recording: Recording) -> dict[str, Table]:
 def _until(pairs: Pairs, end: int) -> Pairs:
     """Without what is beyond the end: how runs of different lengths end is no difference before it."""
     kept = pairs.moments_a[pairs.a] <= end
-    return Pairs(
-        pairs.a[kept],
-        pairs.b[kept],
-        pairs.moments_a,
-        pairs.moments_b,
-        pairs.only_a,
-        pairs.only_b,
-    )
+    return dataclasses.replace(pairs, a=pairs.a[kept], b=pairs.b[kept])
 
 
 def first_difference(one: Recording, other: Recording) -> str | None:

@@ -183,22 +183,22 @@ def _field(name: str, number: int, parts: Sequence[Part], tolerance: float) -> F
         other = np.array(
             [x != y for x, y in zip(a.tolist(), b.tolist(), strict=True)], dtype=np.bool_
         )
-        apart, magnitude, missing = None, None, np.ones_like(other)
-        differs = other
+        apart, magnitude, differs = None, None, other
     else:
         a, b = a.astype(np.float64), b.astype(np.float64)
         empty = np.isnan(a), np.isnan(b)
         missing = empty[0] | empty[1]
         other = (a.view(np.int64) != b.view(np.int64)) & ~(empty[0] & empty[1])
         magnitude = float(np.nanmax(np.abs([a, b]), initial=0.0)) if a.size else 0.0
-        apart = np.where(missing, np.inf, np.abs(a - b))
+        with np.errstate(over="ignore"):  # beyond the largest double it is simply far
+            apart = np.where(missing, np.inf, np.abs(a - b))
         differs = other & (apart > tolerance * magnitude) if tolerance > 0.0 else other
 
     def place(index: int) -> Place:
         part = parts[owner[index]]
         table = part.a
         row = int(part.pairs.a[index - int(np.searchsorted(owner, owner[index]))])
-        distance = None if apart is None or missing[index] else float(apart[index])
+        distance = None if apart is None or not np.isfinite(apart[index]) else float(apart[index])
         share = None if distance is None else distance / magnitude if magnitude else 0.0
         return Place(
             topic=part.topic,
@@ -214,7 +214,7 @@ def _field(name: str, number: int, parts: Sequence[Part], tolerance: float) -> F
         )
 
     wrong = np.flatnonzero(differs)
-    measured = np.flatnonzero(other & ~missing)
+    measured = np.flatnonzero(other & np.isfinite(apart)) if apart is not None else wrong[:0]
     return FieldComparison(
         field=name,
         unit=unit(name),

@@ -43,11 +43,11 @@ def diff(
         raise UsageError(
             f"--tolerance: expected a share from 0 up to 1, as 1e-9, got {tolerance:g}"
         )
-    recordings = []
-    for path in (path_a, path_b):
-        progress(f"reading {path}")
-        recordings.append(read_recording(find_recording(path)))
-    one, other = recordings
+    path_a, path_b = find_recording(path_a), find_recording(path_b)
+    progress(f"reading {path_a}")
+    one = read_recording(path_a)
+    progress(f"reading {path_b}")
+    other = read_recording(path_b)
     configuration = configuration_differences(one, other, tolerance or 0.0)
     found = compare(one, other, tolerance or 0.0)
     verdict = _verdict(one, other, found, configuration)

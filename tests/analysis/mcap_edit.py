@@ -45,7 +45,7 @@ def rewrite(
     """The same recording with every message passed through `edit` (None: left out), then `arrange`d."""
     with source.open("rb") as stream, target.open("wb") as out:
         reader = make_reader(stream)
-        writer = Writer(out)
+        writer = Writer(out, chunk_size=16384)  # so that a cut file still has some
         writer.start()
         for attachment in reader.iter_attachments():
             writer.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)

@@ -378,3 +378,53 @@ def test_what_cannot_be_compared_is_refused(
     assert "none.mcap" in capsys.readouterr().err
     with pytest.raises(UsageError, match="tolerance"):
         diff(one, one, math.inf)
+
+
+def test_a_drawn_channel_of_a_cut_recording_is_not_missing(tmp_path: Path) -> None:
+    """It has no ticks that would say whether what is missing was drawn before the end or after."""
+    write_recording(tmp_path / "plain.mcap", Scenario(nodes=3, ticks=150))
+
+    def drawn(rows: list[tuple[str, Row]]) -> list[tuple[str, Row]]:
+        out: list[tuple[str, Row]] = []
+        for number, row in enumerate(rows):
+            out.append(row)
+            if number % 5 == 0:
+                out.append(("/scene", {"entities": [{"number": number}, {"number": 1}]}))
+        return out
+
+    whole = rewrite(tmp_path / "plain.mcap", tmp_path / "whole.mcap", arrange=drawn)
+    raw = whole.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(raw[: int(0.6 * len(raw))])
+    facts = diff(whole, cut, None)
+    assert facts["verdict"] == "same as far as both go"
+    scene = next(c for c in facts["channels"] if c["kind"] == "/scene")
+    assert 0 < scene["messages"] < sum(topic == "/scene" for topic, _ in messages(whole))
+
+
+def test_numbers_as_far_apart_as_can_be_are_told(one: Path, tmp_path: Path) -> None:
+    def huge(value: float) -> Path:
+        def edit(topic: str, row: Row) -> Row:
+            hit = topic == "/plant/tip" and row["tick"] == 9
+            return row | {"x_m": value} if hit else row
+
+        return rewrite(one, tmp_path / f"{value}.mcap", edit)
+
+    facts = diff(huge(1.7e308), huge(-1.7e308), None)
+    assert (facts["first"]["tick"], facts["first"]["absolute"]) == (9, None)
+    json.dumps(facts, allow_nan=False)
+    diff_table(facts, everything=False)
+    zero = diff(huge(0.0), huge(-0.0), None)
+    assert (zero["verdict"], zero["first"]["absolute"]) == ("different", 0.0)
+    assert diff(huge(0.0), huge(-0.0), 1e-12)["same"] is True
+
+
+def test_the_page_names_every_key_verdict_and_figure(one: Path, seed: Path) -> None:
+    page = (DATA.parents[1] / "docs" / "diff.md").read_text()
+    facts = diff(one, seed, None)
+    named = set(re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", page, flags=re.DOTALL)))
+    keys = {*facts, *facts["a"], *facts["first"], *facts["configuration"][0], *facts["figures"][0]}
+    assert keys <= named
+    assert {"same", "same within the tolerance", "same as far as both go", "different"} <= named
+    for figure in facts["figures"]:
+        assert f"\n{figure['figure']} " in page
