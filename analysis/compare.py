@@ -7,6 +7,7 @@ channels' values; configuration and versions are `analysis.compare_facts`', the 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,7 +68,7 @@ def compare(one: Recording, other: Recording, tolerance: float = 0.0) -> Compari
     writes it.
     """
     tables = _comparable(one), _comparable(other)
-    moved = one.configuration.faces_m != other.configuration.faces_m
+    moved = _moved(one.configuration.faces_m, other.configuration.faces_m)
     ticks_s = one.tick_s, other.tick_s
     ends = last_tick(one), last_tick(other)
     end = min(ends) if ticks_s[0] == ticks_s[1] else None
@@ -101,6 +102,11 @@ def compare(one: Recording, other: Recording, tolerance: float = 0.0) -> Compari
         order=order_difference((one.order, other.order), pairs, tables),
         ends=ends,
     )
+
+
+def _moved(a: Sequence[float], b: Sequence[float]) -> bool:
+    """Whether the segments end elsewhere, and not only by rounding."""
+    return len(a) != len(b) or not np.allclose(a, b, rtol=0.0, atol=1e-12 * max(map(abs, a)))
 
 
 def last_tick(recording: Recording) -> int:

@@ -19,7 +19,7 @@ from analysis.export_files import (
     write_npz,
     write_parquet,
 )
-from analysis.export_tables import Exported
+from analysis.export_tables import DICTIONARY, Exported
 from analysis.recording import find_recording, read_recording
 from analysis.whole_directory import check_free_directory, whole_directory
 from analysis.whole_file import check_free, whole
@@ -103,7 +103,10 @@ def _target(path: Path, name: str, out: Path | None) -> Path:
 
 
 def _is_export(folder: Path) -> bool:
-    """Whether a directory is one that was made here."""
+    """Whether a directory is one that was made here, with nothing of the user's in it."""
+    made = {RUN, *(f"{table}.{kind}" for table in DICTIONARY for kind in DIRECTORIES)}
+    if not {file.name for file in folder.iterdir()} <= made:
+        return False
     try:
         facts = json.loads((folder / RUN).read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -1,7 +1,7 @@
 """A recording as plain tables and arrays, for pandas, polars, R and MATLAB.
 
 First step of the export: `analysis.recording` in, numpy out; the files are `analysis.export_files`'. Nothing is
-computed: a number is the one that was recorded, NaN what was not.
+computed (but where a segment's centre is): a number is the one that was recorded, NaN what was not.
 """
 
 from __future__ import annotations

@@ -41,8 +41,10 @@ def rewrite(
     edit: Callable[[str, Row], Row | None] = lambda _, row: row,
     *,
     arrange: Callable[[list[tuple[str, Row]]], list[tuple[str, Row]]] = lambda rows: rows,
+    about: Callable[[dict[str, str]], dict[str, str]] = lambda metadata: metadata,
 ) -> Path:
-    """The same recording with every message passed through `edit` (None: left out), then `arrange`d."""
+    """The same recording with every message passed through `edit` (None: left out), then `arrange`d;
+    `about` changes its metadata."""
     with source.open("rb") as stream, target.open("wb") as out:
         reader = make_reader(stream)
         writer = Writer(out, chunk_size=16384)  # so that a cut file still has some
@@ -50,7 +52,7 @@ def rewrite(
         for attachment in reader.iter_attachments():
             writer.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
-        writer.add_metadata("octarm", metadata["octarm"])
+        writer.add_metadata("octarm", about(metadata["octarm"]))
         edited = [(topic, edit(topic, row)) for topic, row in messages(source)]
         numbers: dict[str, int] = {}
         for topic, row in arrange([(topic, row) for topic, row in edited if row is not None]):

@@ -16,6 +16,7 @@ from simulated_run import Scenario, write_recording
 
 from analysis.diff import diff
 from analysis.diff_table import diff_table
+from wire.channels import FORMAT_VERSION
 from wire.errors import UsageError
 
 DATA = Path(__file__).parents[1] / "data"
@@ -48,6 +49,8 @@ def octarm(*arguments: str | Path) -> object:
 
 
 def counts(row: Row) -> list[str]:
+    if "message" in row:
+        return ["time_s", "level", "name", "message"]
     return [field for field in row if field != "tick" and not field.endswith("_wall_ns")]
 
 
@@ -153,7 +156,7 @@ def test_another_seed_in_numbers(one: Path, seed: Path) -> None:
     )
     assert [(c["key"], c["a"], c["b"]) for c in facts["configuration"]] == [("seed", 3, 4)]
     a, b = by_tick(one), by_tick(seed)
-    for channel in facts["channels"]:
+    for channel in (c for c in facts["channels"] if c["kind"] != "/scene"):
         own = [key for key in a if kind(key[0]) == channel["kind"]]
         pairs = [
             (tick, topic, field, a[topic, tick][field], b[topic, tick][field])
@@ -353,8 +356,8 @@ def test_a_recording_of_version_3_against_itself_and_a_new_one(one: Path) -> Non
     facts = diff(old, one, None)
     assert facts["verdict"] == "different"
     about = {fact["key"]: (fact["a"], fact["b"]) for fact in facts["about"]}
-    assert about["format_version"] == ("3", "4")
-    assert facts["b"]["format_version"] == 4
+    assert about["format_version"] == ("3", str(FORMAT_VERSION))
+    assert facts["b"]["format_version"] == FORMAT_VERSION
     # Both have three equal segments, so that all is compared, as far as the shorter goes.
     estimate = next(c for c in facts["channels"] if c["kind"] == "/node/NN/estimate")
     assert estimate["messages"] == 3 * 12
@@ -428,3 +431,36 @@ def test_the_page_names_every_key_verdict_and_figure(one: Path, seed: Path) -> N
     assert {"same", "same within the tolerance", "same as far as both go", "different"} <= named
     for figure in facts["figures"]:
         assert f"\n{figure['figure']} " in page
+
+
+def test_faces_that_differ_by_rounding_are_the_same_places(one: Path, tmp_path: Path) -> None:
+    """As when two machines compute Chebyshev's points: the configuration differs, the nodes are compared."""
+
+    def nudged(metadata: dict[str, str]) -> dict[str, str]:
+        run = json.loads(metadata["run"])
+        run["faces_m"][1] = float(np.nextafter(run["faces_m"][1], 1.0))
+        return metadata | {"run": json.dumps(run)}
+
+    near = rewrite(one, tmp_path / "near.mcap", about=nudged)
+    facts = diff(one, near, None)
+    assert (facts["verdict"], facts["channels_not_compared"]) == ("different", [])
+    assert facts["sentence"].startswith("different; all ")
+    assert "the configuration is not: faces_m[1]: 0.333" in facts["sentence"]
+    facts = diff(one, near, 1e-12)
+    assert facts["verdict"] == "same within the tolerance"
+    assert [(c["key"], c["counts"], c["within"]) for c in facts["configuration"]] == [
+        ("faces_m[1]", False, True)
+    ]
+
+
+def test_metadata_that_differs_is_shown_but_does_not_count(one: Path, tmp_path: Path) -> None:
+    def elsewhere(metadata: dict[str, str]) -> dict[str, str]:
+        machine = json.dumps({"cpu": "another", "cores": 2})
+        return metadata | {"versions": '{"octarm": "test", "numpy": "9"}', "machine": machine}
+
+    facts = diff(one, rewrite(one, tmp_path / "there.mcap", about=elsewhere), None)
+    assert facts["verdict"] == "same"
+    found = {(fact["key"], fact["a"]) for fact in facts["about"]}
+    assert ("versions.numpy", None) in found
+    assert any(key.startswith("machine") for key, _ in found)
+    assert "does not count" in diff_table(facts, everything=False)

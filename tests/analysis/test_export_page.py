@@ -7,14 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from analysis.events import FIELDS
 from analysis.export_tables import DICTIONARY, Exported
 from analysis.recording import read_recording
-from wire.channels import EVENTS, SHAPE, Channel, node_channels, plant_channels
+from wire.channels import SHAPE, Channel, node_channels, plant_channels
 from wire.columns import DESCRIPTIONS, channel_name, description, unit
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "export.md").read_text()
-CHANNELS = [*node_channels(1, 3, 5, 3), *plant_channels(3), EVENTS]
+CHANNELS = [*node_channels(1, 3, 5, 3), *plant_channels(3), Channel("/event", FIELDS)]
 
 
 def page_rows(table: str) -> list[str]:

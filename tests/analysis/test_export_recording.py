@@ -90,6 +90,15 @@ def from_csv(folder: Path, name: str) -> Table:
     return {column: [value(column, row[i]) for row in rows] for i, column in enumerate(head)}
 
 
+def told(path: Path) -> list[Row]:
+    """The events of a recording; newer ones count the levels and have more fields."""
+    words = {2: "info", 3: "warning", 4: "error"}
+    names = ("tick", "time_s", "level", "name", "message")
+    rows = [row for topic, row in messages(path) if topic == "/event"]
+    rows = [row | {"level": words.get(row["level"], row["level"])} for row in rows]
+    return [{name: row[name] for name in names} for row in rows]
+
+
 READERS: dict[str, Callable[[Path, str], Table]] = {"parquet": from_parquet, "csv": from_csv}
 
 
@@ -135,7 +144,7 @@ def test_nodes_and_plant_are_the_messages_of_the_file(path: Path, exports: Path,
         ]
     # And every field of every message has a column, but those that are in `sums`.
     for topic, tick in rows:
-        if topic in ("/event", "/plant/shape"):
+        if topic in ("/event", "/scene", "/plant/shape"):
             continue
         general = "/".join("{:02d}" if part.isdigit() else part for part in topic.split("/"))
         for field in rows[topic, tick]:
@@ -167,10 +176,9 @@ def test_sums_are_long_and_complete(path: Path, exports: Path, form: str) -> Non
 @pytest.mark.parametrize("form", READERS)
 def test_events_and_places(path: Path, exports: Path, form: str) -> None:
     events = READERS[form](exports / form, "events")
-    told = [row for topic, row in messages(path) if topic == "/event"]
     assert [
         dict(zip(events, values, strict=True)) for values in zip(*events.values(), strict=True)
-    ] == told
+    ] == told(path)
     places = READERS[form](exports / form, "places")
     run = json.loads((exports / form / "run.json").read_text())["configuration"]
     assert places["inner_face_m"] + places["outer_face_m"][-1:] == run["faces_m"]
@@ -252,9 +260,8 @@ def test_arrays_are_the_messages_of_the_file(path: Path, exports: Path, form: st
     assert facts["configuration"]["seed"] == SCENARIO.seed
     assert data["faces_m"].tolist() == facts["configuration"]["faces_m"]
     assert data["energy_weights"].tolist() == facts["configuration"]["energy_weights"]
-    told = [row for topic, row in messages(path) if topic == "/event"]
-    for field in ("tick", "level", "name", "message"):
-        assert data[f"event_{field}"].tolist() == [row[field] for row in told]
+    for field in ("tick", "time_s", "level", "name", "message"):
+        assert data[f"event_{field}"].tolist() == [row[field] for row in told(path)]
     assert all(len(name) <= 31 for name in data)  # what version 5 allows a variable's name
 
 
@@ -287,6 +294,10 @@ def test_the_verb_writes_beside_the_recording_and_over_nothing_unasked(
         assert octarm(tmp_path, flag) == 2
         assert "it exists already; give another name or --force" in capsys.readouterr().err
     (tmp_path / "recording-csv" / "nodes.csv").write_text("old")
+    (tmp_path / "recording-csv" / "notes.txt").write_text("mine")
+    assert octarm(tmp_path, *every, "--force") == 2
+    assert "which --force does not delete" in capsys.readouterr().err
+    (tmp_path / "recording-csv" / "notes.txt").unlink()
     assert octarm(tmp_path, *every, "--force") == 0
     assert (tmp_path / "recording-csv" / "nodes.csv").stat().st_size > 1000
     assert "rows: nodes 160, plant 40" in capsys.readouterr().out

@@ -11,6 +11,8 @@ from pathlib import Path
 from conftest import ROOT, Start
 from mcap.reader import make_reader
 
+from wire.channels import FORMAT_VERSION
+
 OLD = ROOT / "tests" / "data" / "recording_v3.mcap"
 
 
@@ -45,7 +47,7 @@ def test_a_new_run_repeats_a_recording_of_version_3(start: Start, tmp_path: Path
     assert compared.finish() == 0, compared.out
     facts = compared.json()
     assert facts["same"] is True
-    assert (facts["a"]["format_version"], facts["b"]["format_version"]) == (3, 4)
+    assert (facts["a"]["format_version"], facts["b"]["format_version"]) == (3, FORMAT_VERSION)
     story = next(c for c in facts["channels"] if c["kind"] == "/event")
     assert story["messages"] >= 2 and story["same"]
 
