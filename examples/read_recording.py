@@ -57,7 +57,7 @@ except ImportError:
     print("no pandas here, so no table")
 else:
     octarm("export", recording, "--csv", "--out", work / "csv")
-    nodes = pd.read_csv(work / "csv" / "nodes.csv", float_precision="round_trip")
+    nodes = pd.read_csv(work / "csv" / "nodes.csv")
     wrong = (nodes["estimate_curvature_per_m"] - nodes["truth_curvature_per_m"]).abs()
     print("largest error of the curvature [1/m] at each node:", wrong.groupby(nodes["node"]).max())
 
