@@ -36,6 +36,8 @@ class McapContent:
     payloads: dict[str, list[bytes]]
     """Per topic the messages' payloads in file order; an announced topic may have none."""
     log_times_ns: dict[str, list[int]]
+    order: list[str]
+    """The topic of every message in file order."""
     metadata: dict[str, dict[str, str]]
     """Per name the last metadata record of that name."""
     attachments: dict[str, bytes]
@@ -48,9 +50,10 @@ class McapContent:
 class _Collector:
     payloads: dict[str, list[bytes]] = field(default_factory=dict)
     log_times_ns: dict[str, list[int]] = field(default_factory=dict)
+    order: list[str] = field(default_factory=list)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
-    sinks: dict[int, tuple[list[bytes], list[int]]] = field(default_factory=dict)
+    sinks: dict[int, tuple[str, list[bytes], list[int]]] = field(default_factory=dict)
 
     def take(self, opcode: int, data: memoryview) -> None:
         """Take one record into the collection; those of no interest are dropped."""
@@ -60,12 +63,14 @@ class _Collector:
                 raise McapError(
                     f"a message of channel number {identity}, which was never announced"
                 )
-            payloads, times = self.sinks[identity]
+            topic, payloads, times = self.sinks[identity]
+            self.order.append(topic)
             payloads.append(bytes(data[_MESSAGE.size :]))
             times.append(log_time)
         elif opcode == Opcode.CHANNEL:
             channel = Channel.read(ReadDataStream(BytesIO(data)))
             self.sinks[channel.id] = (
+                channel.topic,
                 self.payloads.setdefault(channel.topic, []),
                 self.log_times_ns.setdefault(channel.topic, []),
             )
@@ -151,6 +156,7 @@ def read_mcap(path: Path) -> McapContent:
     return McapContent(
         payloads=collector.payloads,
         log_times_ns=collector.log_times_ns,
+        order=collector.order,
         metadata=collector.metadata,
         attachments=collector.attachments,
         bytes_read=len(raw),

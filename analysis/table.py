@@ -35,7 +35,7 @@ class Table:
     @property
     def rows(self) -> int:
         """Number of messages."""
-        return self.column("tick").size if self.columns else 0
+        return next((column.size for column in self.columns.values()), 0)
 
     @property
     def ticks(self) -> Ints:
@@ -118,4 +118,4 @@ def _as_column(values: list[Any]) -> Column:
         return np.array(values, dtype=np.int64)
     if kinds <= {int, float, type(None)}:
         return np.array([np.nan if v is None else v for v in values], dtype=np.float64)
-    return np.array(values, dtype=object)
+    return np.fromiter(values, dtype=object, count=len(values))  # lists among them stay lists

@@ -224,6 +224,13 @@ def test_wall_clock_nanoseconds_keep_every_digit() -> None:
     assert int(table.column("at_wall_ns")[0]) == instant
 
 
+def test_lists_of_equal_length_stay_one_value_a_message() -> None:
+    table = decode_table("/x", [b'{"tick":0,"parts":[{"a":1},{}]}', b'{"tick":1,"parts":[{},{}]}'])
+    assert (table.rows, table.column("parts").shape) == (2, (2,))
+    assert table.column("parts").tolist() == [[{"a": 1}, {}], [{}, {}]]
+    assert decode_table("/y", [b'{"entities":[]}']).rows == 1  # others' channels have no tick
+
+
 def test_a_copy_elsewhere_is_enough(finished: Path, tmp_path: Path) -> None:
     shutil.copy(finished, tmp_path / "alone.mcap")
     assert read_recording(tmp_path / "alone.mcap").artefact.arm.name == "test"
