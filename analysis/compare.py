@@ -19,9 +19,9 @@ from analysis.compare_values import KindComparison, Part, Place, compare_kind, k
 from analysis.events import read_events
 from analysis.recording import Recording
 from analysis.table import Table
-from wire.channels import EVENTS
+from wire.foxglove import EVENTS, SCENE
 
-DRAWN = ("/scene",)
+DRAWN = (SCENE.topic,)
 """Channels that only show what others hold: their absence is no difference."""
 AT_NODES = ("/node/", "/plant/truth/")
 """Their values belong to places along the arm: of runs whose segments end elsewhere they are not compared."""
@@ -129,8 +129,8 @@ def _beyond(table: Table | None, cut: Recording, end: int | None) -> bool:
 
 
 def _comparable(recording: Recording) -> dict[str, Table]:
-    """The tables, with the story in the form that all versions share."""
-    tables = dict(recording.tables)
+    """The tables, with the story in the form that all versions share, without channels that drew nothing."""
+    tables = {t: one for t, one in recording.tables.items() if one.rows or t not in DRAWN}
     if EVENTS.topic in tables:
         story = [[getattr(e, name) for name in _STORY] for e in read_events(tables[EVENTS.topic])]
         columns = [np.array(column, dtype=object) for column in zip(*story, strict=True)]

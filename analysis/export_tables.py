@@ -20,7 +20,6 @@ from wire.channels import (
     ANNOUNCED,
     ARM_SO_FAR,
     COMMAND,
-    EVENTS,
     MEASUREMENT,
     SCHEDULE,
     SHAPE,
@@ -32,6 +31,7 @@ from wire.channels import (
 )
 from wire.columns import SUM_UNIT, channel_name, description, unit
 from wire.errors import UsageError
+from wire.foxglove import EVENTS
 
 Array = npt.NDArray[np.float64]
 

@@ -14,6 +14,8 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from wire.columns import channel_name, description, unit
+
 FORMAT_VERSION = 4
 READABLE = (3, 4)
 """Versions that this octarm reads; others are refused by name."""
@@ -56,32 +58,6 @@ the arm's own integration."""
 EVENT = ("timestamp", "level", "name", "message", "file", "line")
 """Fields of foxglove.Log."""
 
-_DESCRIPTION = {
-    "force_n_per_m": "transverse load per length that the plant applies from this tick to the next",
-    "error_m": "distance of the tip from the reference's",
-    "bump_n_per_m": "part of the command that hides a change of gains and is faded out",
-    "strain": "axial strain, dimensionless",
-}
-
-
-_UNITS = {
-    "_m_per_s": "m/s",
-    "_per_m": "1/m",
-    "_n_per_m": "N/m",
-    "_m": "m",
-    "_rad": "rad",
-    "_j": "J",
-    "_s": "s",
-    "_ns": "ns",
-}
-
-
-def unit_of(field: str) -> str:
-    """The unit that the end of a field's name says; "1" if it has none. Running sums are in scaled units,
-    root of an energy: "1" too."""
-    endings = [ending for ending in _UNITS if field.endswith(ending)]
-    return _UNITS[max(endings, key=len)] if endings else "1"
-
 
 @dataclass(frozen=True)
 class Channel:
@@ -99,14 +75,13 @@ class Channel:
     @property
     def schema(self) -> bytes:
         """JSON Schema of a message."""
-        properties: dict[str, dict[str, str]] = {
-            "tick": {"type": "integer"},
-            "time_s": {"type": "number"},
-        }
-        for field in self.fields:
-            properties[field] = {"type": "number", "unit": unit_of(field)}
-            if field in _DESCRIPTION:
-                properties[field]["description"] = _DESCRIPTION[field]
+        channel = channel_name(self.topic)
+        properties: dict[str, dict[str, str]] = {}
+        for field in ("tick", "time_s", *self.fields):
+            properties[field] = {"type": "integer" if field == "tick" else "number"}
+            if text := unit(field):
+                properties[field]["unit"] = text
+            properties[field]["description"] = description(channel, field)
         schema = {
             "type": "object",
             "title": self.schema_name,

@@ -1,7 +1,7 @@
 """What the columns of a recording mean: unit and description of every field of every channel.
 
-Beside `wire.channels`, which has the names; read by the export (a dictionary of columns goes with the data) and
-by the comparison of two recordings (differences with their unit).
+Beside `wire.channels`, which has the names and puts this into the schemas; read by the export (a dictionary of
+columns goes with the data) and by the comparison of two recordings (differences with their unit).
 """
 
 from __future__ import annotations

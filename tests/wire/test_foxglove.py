@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from wire.channels import Channel, columns_of, plant_channels, unit_of
+from wire.channels import Channel, columns_of, plant_channels
 from wire.foxglove import (
     ESTIMATED_ARM,
     EVENTS,
@@ -58,13 +58,6 @@ def test_the_schema_names_the_channel_s_fields(channel: Channel) -> None:
     schema = json.loads(channel.schema)
     assert schema["title"] == channel.schema_name
     assert schema["required"] == ["tick", "time_s", *channel.fields]
-
-
-def test_units_are_the_ends_of_the_names() -> None:
-    units = {"velocity_y_m_per_s": "m/s", "curvature_per_m": "1/m", "force_n_per_m": "N/m"}
-    units |= {"x_m": "m", "turn_rad": "rad", "kinetic_j": "J", "strain": "1", "c0": "1"}
-    units |= {"duration_wall_ns": "ns", "bump_n_per_m": "N/m", "late": "1", "time_s": "s"}
-    assert {field: unit_of(field) for field in units} == units
 
 
 def test_columns_of_a_row() -> None:
