@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 
 from analysis.goals import active_setpoints
-from analysis.recording import Recording, read_recording
+from analysis.recording import Recording, find_recording, read_recording
 from analysis.scene import Pixels, Scene
 from wire.errors import UsageError
 
@@ -68,7 +68,7 @@ def animate(
     if the recording cannot be read or has nothing to draw, if `out` is no .gif, exists (without
     `force`) or cannot be written.
     """
-    path = path / "recording.mcap" if path.is_dir() else path
+    path = find_recording(path)
     out = path.with_name("arm.gif") if out is None else out
     _check_target(out, force)
     recording = read_recording(path)

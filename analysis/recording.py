@@ -63,6 +63,8 @@ class Recording:
     """Per topic."""
     ticks: int
     """K: ticks 0 .. K - 1 were reached by every node and the plant."""
+    attachments: Mapping[str, bytes]
+    """By name, byte for byte."""
 
     def table(self, topic: str) -> Table:
         """The messages of a topic; UsageError if there is no such channel."""
@@ -253,6 +255,11 @@ class Recording:
         return np.stack([self.table(t).by_tick(fields, self.ticks) for t in topics], axis=1)
 
 
+def find_recording(path: Path) -> Path:
+    """The recording itself, where `path` may also be the run's directory that holds it."""
+    return path / "recording.mcap" if path.is_dir() else path
+
+
 def read_recording(path: Path) -> Recording:
     """Read the recording of a run, also one that was cut short.
 
@@ -286,6 +293,7 @@ def read_recording(path: Path) -> Recording:
         counters=content.metadata.get(SUMMARY),
         tables=tables,
         ticks=_common_ticks(tables, configuration),
+        attachments=content.attachments,
     )
 
 
