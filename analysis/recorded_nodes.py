@@ -1,7 +1,8 @@
 """The configurations of a run's node processes: as the recording has them, else made again from its gains.
 
-Between a recording and the replay of its nodes. Since format version 4 they are attached bit for bit. Gains that
-are deployed again give the same matrices with the same machine and libraries; elsewhere rounding may differ.
+Between a recording and the replay of its nodes. Since format version 4 they are attached bit for bit. Gains
+that are deployed again give the same matrices with the same machine and libraries; elsewhere rounding may
+differ.
 """
 
 from __future__ import annotations

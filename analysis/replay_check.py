@@ -231,9 +231,9 @@ def _parts(replayed: Replayed, rows: Rows, nodes: int, *, process: bool) -> Iter
         yield _Part((0, i), i, fields[begin:], rows.of[i][:, begin:OWN], own[:, begin:OWN])
         # Sums between segments of one process: in memory, but recorded as any other.
         at = OWN + rows.forward[i]
-        if i > first or process:
+        if i > first or (process and i > 0):
             yield _forward(i, rows, own[:, OWN:at], nodes)
-        if i < last or process:
+        if i < last or (process and i < nodes - 1):
             yield _backward(i, rows, own[:, at : at + rows.backward[i]], nodes)
     if last < nodes - 1:
         yield _forward(last + 1, rows, replayed.forward, nodes)

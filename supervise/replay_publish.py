@@ -1,8 +1,8 @@
 """A recording published again over Zenoh, for viewers that look at a run while it goes on.
 
 The recorder's way back: telemetry rows out of the file, batches on the same keys and in the same messages as in
-the run. The session is a router, as the plant's is: viewers are its clients. Nothing but telemetry is published;
-there is no node, no plant, no control.
+the run. The session is a router, as the plant's is: viewers are its clients. Nothing but telemetry is
+published; there is no node, no plant, no control.
 """
 
 from __future__ import annotations
@@ -98,8 +98,8 @@ class Publisher:
         clock: Clock | None = None,
     ) -> None:
         """`rate`: seconds of the arm's time in one of the clock, inf for as fast as it goes; `wait`: begin when
-        somebody has subscribed; `listen`: a Zenoh endpoint, default a free port of loopback; `clock`: default the
-        machine's. UsageError for what makes no sense, or an endpoint that cannot be used."""
+        somebody has subscribed; `listen`: a Zenoh endpoint, default a free port of loopback; `clock`: default
+        the machine's. UsageError for what makes no sense, or an endpoint that cannot be used."""
         if not rate > 0.0:
             raise UsageError(f"--rate {rate:g}: expected a positive number")
         self._recording = recording
@@ -122,6 +122,7 @@ class Publisher:
         """Where the router listens; clients connect to it."""
         self.done = Published()
         self._stopped = Event()
+        self._said = 0.0
         self._publishers: dict[int, Any] = {}
         self._session: Any = None
 
@@ -152,7 +153,7 @@ class Publisher:
             self._say(f"waiting for a subscriber on {self.endpoint}")
             while not (self.watched or self._stopped.is_set()):
                 self._stopped.wait(POLL_S)
-        began = self._clock.now()
+        began = self._said = self._clock.now()
         try:
             while not self._stopped.is_set():
                 self._pass(began)
@@ -165,15 +166,14 @@ class Publisher:
 
     def _pass(self, began: float) -> None:
         """All ticks of the span once."""
-        due = said = self._clock.now()
-        self._tell(self._first, began)
+        due = self._clock.now()
         for k in range(self._first, self._last + 1):
             self._tick(k)
             due += self._period_s
             now = self._clock.now()
-            if now - said >= SAY_EVERY_S:
-                said = now
-                self._tell(k, began)
+            if now - self._said >= SAY_EVERY_S:
+                self._said = now
+                self._tell(k, now - began)
             if now - due > LOST_S:
                 due = now
             # also after the last tick: it lasts as long as any other
@@ -192,8 +192,9 @@ class Publisher:
         self.done.ticks += 1
         self._next = k + 1
 
-    def _tell(self, k: int, began: float) -> None:
-        self.done.seconds = self._clock.now() - began
+    def _tell(self, k: int, seconds: float) -> None:
+        """What the progress is."""
+        self.done.seconds = seconds
         tick_s = self._recording.tick_s
         rate = self.done.rate(tick_s)
         held = "" if rate is None else f", {rate:.3g} x real time"
