@@ -7,7 +7,7 @@ artefact (attached), the counters, and one channel per kind of message and node 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -63,7 +63,7 @@ class Recording:
     """Per topic."""
     ticks: int
     """K: ticks 0 .. K - 1 were reached by every node and the plant."""
-    attachments: Mapping[str, bytes]
+    attachments: Mapping[str, bytes] = field(repr=False)
     """By name, byte for byte."""
 
     def table(self, topic: str) -> Table:

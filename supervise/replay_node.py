@@ -59,23 +59,20 @@ def replay_process(
         return peer.replay(feed, rows, process, deadline_s or config.links.deadline_s)
 
 
-def same_messages(recording: Recording, replay: NodeReplay) -> tuple[int, int] | None:
-    """How many of the run's message checksums the process has repeated, of how many; None if it was not fed
-    as many ticks as in the run, or the run's counters are not there.
+def same_messages(recording: Recording, replay: NodeReplay) -> dict[str, bool]:
+    """Per kind of message, named as the counters are, whether the process has repeated the run's checksum.
 
-    A checksum is over all messages of one kind in order, headers and the last command included.
+    A checksum is over all messages of a kind in order, headers and the last command included. Kinds of which
+    the run had another number of messages are left out: it may have ended within a tick.
     """
-    same = total = 0
+    same = {}
     for index, counters in replay.counters.items():
         recorded = recording.process_counters(f"node/{label(index, recording.nodes)}")
         for name in MESSAGES:
-            if f"{name}_crc32" not in counters or f"{name}_crc32" not in recorded:
-                continue
-            if counters[f"{name}_messages"] != recorded[f"{name}_messages"]:
-                return None
-            total += 1
-            same += counters[f"{name}_crc32"] == recorded[f"{name}_crc32"]
-    return (same, total) if total else None
+            count = counters.get(f"{name}_messages", 0)
+            if count > 0 and count == recorded.get(f"{name}_messages"):
+                same[name] = counters[f"{name}_crc32"] == recorded.get(f"{name}_crc32")
+    return same
 
 
 def _relinked(config: NodeConfig, endpoint: str, directory: str | None) -> NodeConfig:
