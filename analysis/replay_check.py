@@ -124,7 +124,7 @@ class Comparison:
         """The whole in one word."""
         if self.differing or self.wrong:
             return Verdict.DIFFERENT
-        return Verdict.INCOMPLETE if self.missing or not self.values else Verdict.EQUAL
+        return Verdict.INCOMPLETE if self.missing else Verdict.EQUAL
 
     def facts(self) -> dict[str, Any]:
         """For --json."""
@@ -191,13 +191,16 @@ def compare(
                 tick = row + story.span.first
                 places.append(((tick, *part.rank, column), part.place(tick, column)))
     done = [replayed.ticks for replayed in replays]
+    missing = list(_missing(story, feeds, replays))
+    if not values and not missing:
+        missing.append("there is nothing in these ticks to compare: they were late")
     return Comparison(
         values=values,
         differing=differing,
         first=min(places, key=lambda place: place[0])[1] if places else None,
         node_ticks=sum(n * len(feed.segments) for n, feed in zip(done, feeds, strict=True)),
         ticks=max(done, default=0),
-        missing=tuple(_missing(story, feeds, replays)),
+        missing=tuple(missing),
         wrong=tuple(replayed.broke_off for replayed in replays if replayed.broke_off),
     )
 
@@ -270,33 +273,38 @@ def _missing(story: Story, feeds: Sequence[Feed], replays: Sequence[Replayed]) -
         reached = max((feed.ticks[-1] for feed in feeds if feed.ticks), default=-1)
         yield f"the file {cut}; nothing is there after tick {reached}"
     for feed, replayed in zip(feeds, replays, strict=True):
-        who = name_of(feed.config)
         if replayed.ended is not None:
             yield replayed.ended
-        elif feed.stops <= last:
-            yield from _unknown(recording, feed, who)
+        elif (why := _unknown(story, feed, last)) is not None:
+            upto = f"replayed up to tick {feed.ticks[-1]}" if feed.ticks else "not replayed"
+            yield f"{name_of(feed.config)}: {upto}; {why}"
+    fed = {feed.config.index for feed in feeds}
+    for config in story.nodes.configs:  # whose rows have the sums that these gave
+        near = {config.index - 1, config.last + 1} & {i for f in feeds for i in f.segments}
+        if near and config.index not in fed:
+            why = _unknown(story, story.feed(config), last)
+            if why is not None:
+                yield f"{name_of(config)}, which got its sums: {why}, so not all of them can be compared"
     if not any(feed.ticks for feed in feeds):
         yield "there is no tick of which a node has recorded everything"
 
 
-def _unknown(recording: Recording, feed: Feed, who: str) -> Iterator[str]:
-    """Why a process stops where it does, unless that is its end."""
-    upto = f"{who}: replayed up to tick {feed.stops - 1}" if feed.ticks else f"{who}: not replayed"
+def _unknown(story: Story, feed: Feed, last: int) -> str | None:
+    """Why a process stops before tick `last`; None if it does not, or that is its end."""
+    recording = story.recording
+    if feed.stops > last and story.span.last is not None:
+        return None
     if feed.lost:
-        yield (
-            f"{upto}; its telemetry of tick {feed.stops} was lost, so the state of {feed.lost} later ticks "
-            "is not known"
-        )
-        return
+        return f"telemetry of tick {feed.stops} was lost, and with it the state of {feed.lost} later ticks"
     if recording.unfinished is not None:
-        return  # said once for all
+        return None  # said once for all
     counters = recording.process_counters(f"node/{label(feed.config.index, recording.nodes)}")
     if not counters:
-        yield f"{upto}; it sent no last word, so whether more followed is not known"
-        return
-    done = counters.get("command_sent_messages")
-    if done is not None and done > len(feed.ticks):
-        yield f"{upto}; telemetry of {done - len(feed.ticks)} ticks after that was lost"
+        return "it sent no last word, and whether more followed is not known"
+    done = counters.get("command_sent_messages", 0)
+    if done > len(feed.ticks):
+        return f"telemetry of {done - len(feed.ticks)} ticks after that was lost"
+    return None
 
 
 def _bits(values: Array) -> npt.NDArray[np.int64]:

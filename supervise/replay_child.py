@@ -73,7 +73,6 @@ class StartedNode:
         self.node: Handle | None = None
         self.ready = False
         self.waits_for: list[str] = []
-        self.stopped = False
         self.ended: str | None = None
         """How it ended, once it has."""
         self.failure: str | None = None
@@ -88,7 +87,8 @@ class StartedNode:
         if self.node is not None:
             self._end(self.node)
             self.node.close()
-        self._zygote.control.close()  # its lifeline
+        with contextlib.suppress(OSError):  # it is gone, and did not read what it was told
+            self._zygote.control.close()  # its lifeline
         self._end(self._zygote)
         self._turns.forget(self._zygote.status)
         self._zygote.reap()
@@ -123,8 +123,6 @@ class StartedNode:
                     self.ready = True
                 case "waiting":
                     self.waits_for = line["missing"]
-                case "stopped":
-                    self.stopped = True
                 case "failed":
                     self.failure = line["message"]
                 case "died":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -251,10 +252,39 @@ def test_lost_rows_end_the_replay_of_their_node_only(tmp_path: Path) -> None:
     assert found.differing == 0
     assert found.node_ticks == 60 + 30 + 60
     (text,) = found.missing
-    assert text.startswith("node 1: replayed up to tick 29; its telemetry of tick 30 was lost")
-    assert "28 later ticks" in text
+    assert text == (
+        "node 1: replayed up to tick 29; telemetry of tick 30 was lost, and with it the state of 28 later ticks"
+    )
     assert checked(path, Span(0, 29)).verdict is Verdict.EQUAL
     assert checked(path, Span(0, 30)).verdict is Verdict.INCOMPLETE
+
+
+def test_late_ticks_alone_are_not_called_equal(tmp_path: Path) -> None:
+    path = tmp_path / "late.mcap"
+    write_recording(path, Scenario(nodes=2, ticks=20, late=frozenset({7, 8})))
+    found = checked(path, Span(7, 8))
+    assert found.verdict is Verdict.INCOMPLETE
+    assert found.missing == ("there is nothing in these ticks to compare: they were late",)
+    assert checked(path, Span(6, 8)).verdict is Verdict.EQUAL
+
+
+def test_rows_that_nobody_got_at_the_end_are_missed_by_the_counters(tmp_path: Path) -> None:
+    """All telemetry of the last two ticks was lost; only how many commands a node sent tells it."""
+    path = tmp_path / "recording.mcap"
+    write_recording(path, Scenario(nodes=2, ticks=20))
+    recording = read_recording(path)
+    counters = dict(recording.counters or {})
+    for i, sent in enumerate((20, 22)):
+        own = recording.process_counters(f"node/{i:02d}") | {"command_sent_messages": sent}
+        counters[f"node/{i:02d}"] = json.dumps(own)
+    found = check(story_of(dataclasses.replace(recording, counters=counters)))
+    assert found.verdict is Verdict.INCOMPLETE
+    assert found.missing == (
+        "node 1: replayed up to tick 19; telemetry of 2 ticks after that was lost",
+    )
+    counters.pop("node/00")
+    found = check(story_of(dataclasses.replace(recording, counters=counters)))
+    assert found.missing[0].startswith("node 0: replayed up to tick 19; it sent no last word")
 
 
 def test_lost_rows_of_the_plant_are_not_needed(tmp_path: Path) -> None:

@@ -101,6 +101,19 @@ def test_several_segments_of_one_process(tmp_path: Path) -> None:
     assert given.counters[2]["passed_messages"] + given.counters[3]["passed_messages"] == 2 * ticks
 
 
+def test_rows_that_a_neighbour_lost_are_missed(tmp_path: Path) -> None:
+    """What node 1 sent to node 2 in tick 7 is recorded nowhere."""
+    path = tmp_path / "recording.mcap"
+    write_recording(path, Scenario(nodes=4, ticks=20), skip=frozenset({(7, 2)}))
+    story = story_of(read_recording(path))
+    found, _ = replayed(story, 1)
+    assert found.verdict is Verdict.INCOMPLETE
+    assert (found.ticks, found.differing) == (20, 0)
+    (text,) = found.missing
+    assert text.startswith("node 2, which got its sums: telemetry of tick 7 was lost")
+    assert replayed(story, 0)[0].verdict is Verdict.EQUAL
+
+
 @pytest.mark.parametrize(
     ("channel", "field"), [("estimate", "strain"), ("command", "force_n_per_m")]
 )

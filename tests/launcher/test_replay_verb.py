@@ -160,7 +160,7 @@ def test_a_run_that_was_interrupted_or_stopped_is_replayed_to_its_end(
             assert facts["verdict"] == "incomplete"
             (text,) = (str(text) for text in _list(facts["missing"]))
             assert text.startswith("node 1: replayed up to tick ")
-            assert "no last word" in text
+            assert "it sent no last word" in text
         else:
             assert equal(facts)
             assert equal(replay(cli.recording(), "--node", "1"))
