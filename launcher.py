@@ -14,7 +14,7 @@ import tyro
 
 from supervise.entry import serve, show_json, teller
 from supervise.options import RunOptions
-from supervise.recording_verbs import animate, diff, export
+from supervise.recording_verbs import animate, diff, export, replay
 from supervise.shipped import DEFAULT_ARM, DEFAULT_GAINS
 from wire.errors import ExitCode, UsageError
 
@@ -426,6 +426,7 @@ VERBS: dict[str, Callable[..., int]] = {
     "animate": animate,
     "diff": diff,
     "export": export,
+    "replay": replay,
     "study": study,
     "bench": bench,
     "doctor": doctor,

@@ -7,7 +7,7 @@ artefact (attached), the counters, and one channel per kind of message and node 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -63,6 +63,8 @@ class Recording:
     """Per topic."""
     ticks: int
     """K: ticks 0 .. K - 1 were reached by every node and the plant."""
+    attachments: Mapping[str, bytes] = field(repr=False)
+    """By name, byte for byte."""
     order: Sequence[str] = ()
     """The topic of every message, in the order of the file."""
 
@@ -294,6 +296,7 @@ def read_recording(path: Path) -> Recording:
         tables=tables,
         ticks=_common_ticks(tables, configuration),
         order=content.order,
+        attachments=content.attachments,
     )
 
 

@@ -33,12 +33,16 @@ def main() -> int:
     parser.add_argument(
         "--remote", action="store_true", help="with --zygote: the launcher is on another machine"
     )
+    parser.add_argument(
+        "--directory", help="with --zygote: private directory to remove if the launcher dies"
+    )
     parser.add_argument("--parent", type=int, default=os.getppid(), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.zygote:
         from node.zygote import serve
 
-        return serve(None if arguments.remote else arguments.parent)
+        parent = None if arguments.remote else arguments.parent
+        return serve(parent, directory=arguments.directory)
     if arguments.configuration is None:
         parser.error("give a configuration file or --zygote")
     try:

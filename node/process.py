@@ -9,7 +9,6 @@ tick has left.
 from __future__ import annotations
 
 import gc
-import math
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -18,14 +17,13 @@ from time import monotonic_ns
 from typing import Any
 
 from node.block import NotFiniteError, SegmentBlock
+from node.configured import sweeps_of
 from node.row import Y
-from node.scheduling import Sectors
-from node.sweep import Array, NodeSweep, payload
+from node.sweep import Array, payload
 from wire import session as zsession
 from wire.child import Child, Deadline
 from wire.counters import Flow, Rejections
 from wire.errors import ExitCode
-from wire.factors import NodeFactors
 from wire.keys import Keys
 from wire.messages import (
     HEADER_BYTES,
@@ -42,8 +40,7 @@ from wire.messages import (
     run_tag,
 )
 from wire.placement import place, step_back
-from wire.reference import Reference
-from wire.run_config import NodeConfig, SegmentConfig
+from wire.run_config import NodeConfig
 
 PLANT_PATIENCE = 3.0
 """Between two ticks a node waits this many deadlines: the plant, which has its own, should speak
@@ -60,7 +57,7 @@ class NodeProcess:
         self._child = child
         self._supervised = supervised
         self._keys = Keys(run_tag(config.run_id))
-        sweeps = [_sweep(config, segment) for segment in config.segments]
+        sweeps = sweeps_of(config)
         first, last = sweeps[0], sweeps[-1]
         self._lock = Lock()
         self._stop: Stop | None = None
@@ -332,14 +329,3 @@ class NodeProcess:
         """Leave a batch to the main thread: nothing on the way of a tick waits for it."""
         self._batches.append((tick, rows))
         self._child.wake()
-
-
-def _sweep(config: NodeConfig, segment: SegmentConfig) -> NodeSweep:
-    reference = Reference.from_plain(segment.reference)
-    return NodeSweep(
-        NodeFactors.from_plain(segment.factors),
-        config.setpoint,
-        reference=reference,
-        sectors=Sectors.of(config.scheduling),
-        fade=math.exp(-reference.tick_s / config.scheduling.bump_s),
-    )

@@ -18,17 +18,20 @@ from wire.run_config import NodeConfig, loads
 SILENCE_S = 30.0
 """A remote launcher writes an empty line more often than this (supervise.far); without one it is lost,
 though nobody has closed the pipe."""
+DYING_S = 1.0
+"""A launcher of many threads takes less than this to die."""
 
 
-def serve(parent: int | None) -> int:
+def serve(parent: int | None, *, directory: str | None = None) -> int:
     """Fork a node a line until the launcher says stop or is gone; returns the exit code.
 
-    `parent` is the launcher's process; None: it is on another machine.
+    `parent` is the launcher's process; None: it is on another machine. `directory`: private to the nodes that
+    are forked here, removed if the launcher dies.
     """
     if parent is not None:
         die_with_parent(parent)
     name_process("octarm-zygote")
-    child = Child("zygote", control=0, status=1, directory=None)
+    child = Child("zygote", control=0, status=1, directory=directory)
     nursery = Nursery(child)
     silence = Deadline(SILENCE_S)
     while not child.stopping:
@@ -42,7 +45,20 @@ def serve(parent: int | None) -> int:
                 _birth(line, child, nursery)
         nursery.reap()
     nursery.end()
+    if directory is not None:
+        _leave(child)
     return 0
+
+
+def _leave(child: Child) -> None:
+    """Remove the private directory if the launcher is dead.
+
+    The signal of its death comes when its first thread is gone: its lifeline ends with the last one.
+    """
+    patience = Deadline(DYING_S)
+    while not (child.orphaned or patience.passed):
+        child.wait_lines(patience.left)
+    child.leave([])
 
 
 def _birth(line: bytes, child: Child, nursery: Nursery) -> None:

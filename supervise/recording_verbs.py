@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -14,6 +15,7 @@ from supervise.entry import show_json, teller
 from wire.errors import ExitCode
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
+From = Annotated[int | None, tyro.conf.arg(name="from")]
 
 
 def animate(
@@ -114,3 +116,54 @@ def export(
             f"octarm export: the recording {stops}; everything before is exported", file=sys.stderr
         )
     return int(ExitCode.OK if facts["complete"] else ExitCode.DEGRADED)
+
+
+def replay(
+    recording: tyro.conf.Positional[Path],
+    *,
+    node: int | None = None,
+    publish: Flag = False,
+    first: From = None,
+    to: int | None = None,
+    deadline: float | None = None,
+    rate: float | None = None,
+    loop: Flag = False,
+    at_once: Flag = False,
+    listen: str | None = None,
+    json: Flag = False,
+    quiet: Flag = False,
+) -> int:
+    """Replay a recording: every node's mathematics, or one real process, compared bit for bit; or publish it.
+
+    Args:
+        recording: The recording, or the run's directory that holds it.
+        node: Feed the recorded messages to the real process that has this node, over Zenoh.
+        publish: Publish the telemetry over Zenoh again, for viewers, instead of comparing anything.
+        first: First tick that is compared or published; default: 0.
+        to: Last tick that is compared or published; default: the last one.
+        deadline: Longest wait for the process's answer in seconds, with --node; default: the run's.
+        rate: Seconds of the arm's time in one of the clock, with --publish; default 1.
+        loop: Begin again at the end, with --publish, until Ctrl-C.
+        at_once: Begin without waiting for a subscriber, with --publish.
+        listen: Zenoh endpoint for viewers, with --publish: tcp/ADDRESS:PORT or unixsock-stream/PATH; default:
+            a free port of loopback.
+        json: Print one JSON object instead of the lines.
+        quiet: No progress.
+    """
+    from supervise.replaying import Options, run_replay
+
+    options = Options(
+        recording=recording,
+        node=node,
+        publish=publish,
+        first=first,
+        last=to,
+        deadline_s=deadline,
+        rate=rate,
+        loop=loop,
+        at_once=at_once,
+        listen=listen,
+    )
+    done = run_replay(options, teller(silent=quiet or json))
+    show_json(done.facts) if json else print(done.text)
+    return int(done.exit_code)
