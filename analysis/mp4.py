@@ -52,7 +52,7 @@ def write_mp4(
     """
     command = [
         find_ffmpeg(out),
-        *("-hide_banner", "-loglevel", "error", "-y"),
+        *("-hide_banner", "-loglevel", "error", "-xerror", "-y"),
         *("-f", "rawvideo", "-pixel_format", "rgb24"),
         *("-video_size", f"{size[0]}x{size[1]}", "-framerate", f"{fps:.6g}", "-i", "pipe:0"),
         *("-c:v", ENCODER, "-preset", "medium", "-crf", str(QUALITY), "-pix_fmt", "yuv420p"),
@@ -70,8 +70,31 @@ def write_mp4(
         finally:
             process.kill()  # of no effect on one that has ended
             process.wait()
-        if code != 0:
+        # ffmpeg 5 ends with 0 where the disk was full for the last bytes: look at what it left.
+        if code != 0 or not is_whole(path):
             raise UsageError(f"--out {out}: ffmpeg failed: {_last_words(said, code)}")
+
+
+def is_whole(path: Path) -> bool:
+    """Whether the boxes of an MP4 file reach to its end, index and pictures among them, the index first."""
+    kinds = []
+    with path.open("rb") as file:
+        left = file.seek(0, 2)
+        file.seek(0)
+        while left > 0:
+            head = file.read(8)
+            if len(head) < 8:
+                return False
+            size = int.from_bytes(head[:4], "big")
+            if size == 1:  # the true one follows, in 64 bits
+                size = int.from_bytes(file.read(8), "big")
+            if size < 8 or size > left:
+                return False
+            kinds.append(head[4:])
+            left -= size
+            file.seek(-left, 2)
+    wanted = [kind for kind in kinds if kind in (b"moov", b"mdat")]
+    return wanted == [b"moov", b"mdat"]
 
 
 def _feed(process: subprocess.Popen[bytes], frames: Iterable[Pixels]) -> None:
@@ -95,4 +118,4 @@ def _last_words(said: IO[bytes], code: int) -> str:
         return words[-1]
     if code < 0:
         return f"it was ended by {signal.Signals(-code).name}"
-    return f"exit code {code}, and it said nothing"
+    return f"exit code {code}, it said nothing, and the film is not whole"
