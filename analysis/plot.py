@@ -32,8 +32,8 @@ from wire.errors import UsageError
 WIDTH_IN, DPI = 14.0, 100
 SINGLE_IN = 9.0
 """Width of a figure of one panel."""
-COLUMN_IN = 4.0
-"""A panel is not drawn narrower."""
+COLUMN_IN, ROW_IN = 4.5, 3.4
+"""A panel is not drawn narrower or lower."""
 TALL = {1: 0.62, 2: 0.72, 3: 0.83}
 """Height of a panel over its width, by the number of columns."""
 LINE_IN, KEY_IN = 0.2, 2.3
@@ -102,7 +102,8 @@ class Choice:
     def size_in(self) -> tuple[float, float]:
         """Width and height of the figure."""
         rows, columns = self.grid
-        return self._width, 0.6 + rows * TALL[columns] * self._width / columns
+        tall = max(ROW_IN, TALL[columns] * self._width / columns)
+        return self._width, 0.6 + rows * tall
 
     @property
     def _width(self) -> float:
@@ -233,8 +234,9 @@ def draw(
             figure.legend(
                 handles=key, loc="outside lower center", ncols=min(len(key), beside), frameon=False
             )
-        # Place everything now, with the fonts of this style.
+        # Place everything now, with the fonts of this style, and only once.
         figure.draw_without_rendering()
+        figure.set_layout_engine("none")
     return figure
 
 

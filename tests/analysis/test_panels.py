@@ -440,7 +440,7 @@ def test_a_file_cut_short_says_so_and_shows_what_there_is(held: Path, share: flo
 
 def test_nothing_written_in_a_panel_leaves_the_figure(path: Path) -> None:
     recording = read_recording(path)
-    for choice in (Choice(), Choice(("messages", "shapes"), 8.0), Choice(("tip",), 4.0)):
+    for choice in (Choice(), Choice(("messages", "shapes"), 9.0), Choice(("tip",), 4.5)):
         figure = draw(recording, choice, lambda _: None)
         wide, tall = (figure.get_size_inches() * figure.dpi).tolist()
         for ax in figure.axes:

@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import re
 from pathlib import Path
 from unittest import mock
 
@@ -102,8 +103,8 @@ def test_nothing_is_written_over_unasked(
     ("arguments", "culprit"),
     [
         (["--only", "tips"], "no panel 'tips' (did you mean tip?); expected some of shapes, "),
-        (["--width", "2"], "--width: expected 4 to 60 inches, got 2"),
-        (["--width", "nan"], "--width: expected 4 to 60 inches, got nan"),
+        (["--width", "2"], "--width: expected 4.5 to 60 inches, got 2"),
+        (["--width", "nan"], "--width: expected 4.5 to 60 inches, got nan"),
         (["--dpi", "1000"], "--dpi: expected 30 to 600 dots an inch, got 1000"),
         (["--dpi", "600", "--width", "40"], "pixels, expected at most 100 million"),
         (["--out", "plot.jpg"], "plot.jpg: expected a name that ends in .png, .pdf or .svg"),
@@ -159,7 +160,11 @@ def test_help_and_default_know_every_panel() -> None:
     assert plot.__doc__ is not None
     listed = inspect.cleandoc(plot.__doc__).partition("default all: ")[2].partition(".\n")[0]
     assert [name.strip() for name in listed.split(",")] == list(PANELS)
+    page = (Path(__file__).parents[2] / "docs/plots.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ((?:`[a-z-]+`(?:, )?)+) \|", page, re.MULTILINE)
+    named = [name for row in rows for name in re.findall(r"`([^`]+)`", row)]
+    assert [name for name in named if not name.startswith("--")] == list(PANELS)
     assert Choice().names == tuple(PANELS)
     assert Choice(("tip", "tip")).names == ("tip",)
     assert Choice(width_in=5.0).grid == (len(PANELS), 1)
-    assert Choice(width_in=8.0).grid == ((len(PANELS) + 1) // 2, 2)
+    assert Choice(width_in=9.0).grid == ((len(PANELS) + 1) // 2, 2)

@@ -75,7 +75,7 @@ def test_wrong_option(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("verb", [["deploy", "--out"], ["animate"]])
+@pytest.mark.parametrize("verb", [["deploy", "--out"], ["animate"], ["plot"]])
 def test_a_name_that_is_too_long_for_a_file(
     verb: list[str], capfd: pytest.CaptureFixture[str]
 ) -> None:
