@@ -21,7 +21,7 @@ from analysis.goals import active_setpoints
 from analysis.mp4 import even, find_ffmpeg, write_mp4
 from analysis.recording import Recording, find_recording, read_recording
 from analysis.scene import Pixels, Scene
-from analysis.whole_file import check_target, whole
+from analysis.whole_file import check_free, whole
 from wire.errors import UsageError
 
 FILM_S = 10.0
@@ -75,7 +75,7 @@ def animate(
     path = find_recording(path)
     out = path.with_name("arm.gif") if out is None else out
     _check_kind(out, film)
-    check_target(out, force=force)
+    check_free(out, force=force)
     recording = read_recording(path)
     drawable = np.flatnonzero(np.isfinite(recording.shapes_m).all(axis=(1, 2)))
     if drawable.size < 2:

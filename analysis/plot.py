@@ -26,7 +26,7 @@ from analysis.goals import active_setpoints
 from analysis.panels import PANELS, SUMMARY
 from analysis.panels.frame import Cell, key_of_marks, missing_ticks
 from analysis.recording import Recording, find_recording, read_recording
-from analysis.whole_file import check_target, whole
+from analysis.whole_file import check_free, whole
 from wire.errors import UsageError
 
 WIDTH_IN, DPI = 14.0, 100
@@ -154,7 +154,7 @@ def plot_file(
     kind = out.suffix.lower()
     if kind not in NOTHING_THAT_CHANGES:
         raise UsageError(f"--out {out}: expected a name that ends in .png, .pdf or .svg")
-    check_target(out, force=force)
+    check_free(out, force=force)
     recording = read_recording(path)
     with whole(out, force=force) as growing:
         figure = draw(recording, choice, progress)

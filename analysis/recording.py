@@ -292,7 +292,7 @@ class Recording:
 
 
 def find_recording(path: Path) -> Path:
-    """The recording that is meant: the file itself, or the one in a run's directory."""
+    """The recording that a user means: the file itself, or the one in the run's directory."""
     return path / "recording.mcap" if path.is_dir() else path
 
 

@@ -1,7 +1,4 @@
-"""A file that appears whole or not at all: for everything that writes what a user will open later.
-
-Between the verbs about recordings and the disk.
-"""
+"""A file that appears whole or not at all and writes over nothing unasked: for what a verb leaves behind."""
 
 from __future__ import annotations
 
@@ -14,8 +11,8 @@ from pathlib import Path
 from wire.errors import UsageError
 
 
-def check_target(out: Path, *, force: bool) -> None:
-    """Raise UsageError if `out` is a directory, or exists already and may not be written over."""
+def check_free(out: Path, *, force: bool) -> None:
+    """Raise UsageError if `out` is a directory, or exists and may not be written over."""
     if out.is_dir():
         raise UsageError(f"--out {out}: that is a directory; give the name of a file")
     if out.exists() and not force:
@@ -26,9 +23,9 @@ def check_target(out: Path, *, force: bool) -> None:
 def whole(out: Path, *, force: bool) -> Iterator[Path]:
     """A file beside `out` that takes its place when all has gone well, and goes away if not.
 
-    Raises UsageError as `check_target` does, before and after, and if `out` cannot be written.
+    Raises UsageError if `out` exists (without `force`), is a directory or cannot be written.
     """
-    check_target(out, force=force)
+    check_free(out, force=force)
     try:
         handle, name = tempfile.mkstemp(dir=out.parent, prefix=f".{out.stem}-", suffix=out.suffix)
         os.close(handle)
@@ -40,7 +37,7 @@ def whole(out: Path, *, force: bool) -> Iterator[Path]:
     try:
         yield growing
         growing.chmod(0o644)
-        check_target(out, force=force)  # somebody else may have been quicker
+        check_free(out, force=force)  # somebody else may have been quicker
         growing.replace(out)
     except OSError as error:
         raise UsageError(f"--out {out}: {error.strerror or error}") from None

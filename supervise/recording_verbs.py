@@ -58,7 +58,7 @@ def plot(
     json: Flag = False,
     quiet: Flag = False,
 ) -> int:
-    """Plot a run: shapes, curvature, estimate against truth, commands, errors, sweeps, messages.
+    """Plot a run: shapes, errors, curvature, commands, sweeps, messages. Exit code 3 if it was cut short.
 
     Args:
         recording: The recording, or the run's directory that holds it.
@@ -77,4 +77,4 @@ def plot(
     progress = teller(silent=quiet or json)
     facts = plot_file(recording, out, Choice(only, width, dpi), progress, force=force)
     show_json(facts) if json else print(plot_line(facts))
-    return int(ExitCode.OK)
+    return int(ExitCode.OK if facts["recording_complete"] else ExitCode.DEGRADED)

@@ -150,6 +150,19 @@ def test_a_recording_without_a_tick_is_refused(
     assert "expected at least 1 complete tick to plot, got none" in capsys.readouterr().err
 
 
+def test_a_recording_cut_short_is_plotted_and_told(
+    path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = tmp_path / "short.mcap"
+    raw = path.read_bytes()
+    short.write_bytes(raw[: len(raw) - 100])
+    assert octarm(short, "--only", "tip", "messages", "--out", tmp_path / "cut.png") == 3
+    assert ", recording unfinished, " in capsys.readouterr().out
+    assert octarm(short, "--only", "tip", "--json") == 3
+    assert json.loads(capsys.readouterr().out)["recording_complete"] is False
+    assert (tmp_path / "cut.png").exists() and (tmp_path / "tip.png").exists()
+
+
 def test_nothing_is_left_of_a_plot_that_failed(path: Path, tmp_path: Path) -> None:
     with mock.patch("analysis.plot.draw", side_effect=KeyboardInterrupt):
         assert octarm(path, "--out", tmp_path / "plot.png") == 130
