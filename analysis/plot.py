@@ -24,7 +24,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from analysis.goals import active_setpoints
 from analysis.panels import PANELS, SUMMARY
-from analysis.panels.frame import Cell, key_of_marks, missing_ticks
+from analysis.panels.frame import Cell, key_of_marks, missing_ticks, ticks_in_words
 from analysis.recording import Recording, find_recording, read_recording
 from analysis.whole_file import check_free, whole
 from wire.errors import UsageError
@@ -186,7 +186,7 @@ def plot_line(facts: dict[str, Any]) -> str:
         size = f"{facts['width_in']:.3g} x {facts['height_in']:.3g} in"
     cut = "" if facts["recording_complete"] else ", recording unfinished"
     return (
-        f"{facts['plot']}: {what} of {facts['ticks']} ticks{cut}, {size}, "
+        f"{facts['plot']}: {what} of {ticks_in_words(facts['ticks'])}{cut}, {size}, "
         f"{facts['bytes'] / 1e6:.2f} MB"
     )
 
@@ -245,7 +245,7 @@ def title_parts(recording: Recording) -> list[str]:
     run = recording.configuration
     parts = [
         f"scenario {run.scenario!r}",
-        f"{run.nodes} nodes, {recording.ticks} ticks of {run.tick_s:g} s",
+        f"{run.nodes} nodes, {ticks_in_words(recording.ticks)} of {run.tick_s:g} s",
         f"setpoint {' - '.join([run.setpoint, *(leg.to for leg in run.legs)])}",
         f"initial shape {run.initial!r}",
         f"disturbance {run.disturbance.name!r}",

@@ -10,6 +10,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from analysis.panels.frame import (
     BLUE,
+    FEW,
     GREEN,
     GREY,
     VERMILION,
@@ -70,7 +71,8 @@ def draw_sweep_course(cell: Cell, recording: Recording) -> None:
     if finite.size == 0:
         say(ax, "no sweep was completed")
         return
-    ax.plot(recording.times_s, durations, ".", color=BLUE, markersize=2.5, alpha=0.6)
+    size = 5.0 if finite.size < FEW else 2.5
+    ax.plot(recording.times_s, durations, ".", color=BLUE, markersize=size, alpha=0.6)
     for percentile, (tone, dashes) in DRAWN.items():
         value = float(np.percentile(finite, percentile))
         ax.axhline(value, color=tone, linestyle=dashes, linewidth=1.4, label=f"p{percentile:g}")
@@ -80,7 +82,7 @@ def draw_sweep_course(cell: Cell, recording: Recording) -> None:
         ax.axhline(1e3 * pace.period_s, color="black", linewidth=1.0, linestyle=":", label=label)
     ax.set_yscale("log")
     low, high = ax.get_ylim()
-    ax.set_ylim(low, 2.5 * high)  # room for the key
+    ax.set_ylim(0.8 * low, 2.5 * high)  # room for the key
     ax.yaxis.set_major_formatter(FuncFormatter(in_full))
     ax.yaxis.set_minor_formatter(FuncFormatter(_sparse))
     ax.set_ylabel("wall-clock time [ms]")

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import ScaledTranslation, blended_transform_factory
 
 from analysis.goals import active_setpoints, colour
@@ -28,6 +29,7 @@ STRIP_PT = 4.0
 """Of the strip above the axes that has the colour of the gains in use."""
 FEW = 60
 """With fewer values than this in a course each one is drawn as a point as well."""
+SHORT_S = 0.05
 BREAKS = ("interrupted", "safety_stop", "telemetry_lost")
 """Events that a line marks; the changes of gains and the late ticks have marks of their own."""
 
@@ -83,8 +85,7 @@ def breaks(recording: Recording) -> dict[str, list[float]]:
     if table is not None and table.rows:
         for tick, name in zip(table.ticks.tolist(), table.column("name"), strict=True):
             if name in BREAKS:
-                at = min(max(tick, 0), recording.ticks) * recording.tick_s
-                found.setdefault(name, []).append(at)
+                found.setdefault(name, []).append(tick * recording.tick_s)
     return found
 
 
@@ -93,7 +94,10 @@ def over_time(ax: Any, recording: Recording, *, top: bool = True, bottom: bool =
 
     top, bottom: whether the axes are the uppermost or lowest of a stack, which have those marks.
     """
-    ax.set_xlim(0.0, end_s(recording))
+    end = end_s(recording)
+    ax.set_xlim(-0.02 * end if recording.ticks < FEW else 0.0, end)  # single points stand free
+    if end < SHORT_S:
+        ax.xaxis.set_major_locator(MaxNLocator(4))  # for its long labels
     across = ax.get_xaxis_transform()
     if bottom:
         ax.set_xlabel("time [s]")
@@ -113,7 +117,8 @@ def over_time(ax: Any, recording: Recording, *, top: bool = True, bottom: bool =
             )
     for times in breaks(recording).values():
         for at in times:
-            ax.axvline(at, color=PURPLE, linewidth=1.6, linestyle=(0, (3, 1.5)), zorder=5)
+            # What ended the run may have come after the last tick that all have told of.
+            ax.axvline(min(at, end), color=PURPLE, linewidth=1.6, linestyle=(0, (3, 1.5)), zorder=5)
     runs = runs_of(active_setpoints(recording))
     if len(runs) < 2:
         return
@@ -151,13 +156,18 @@ def key_of_marks(recording: Recording) -> list[Any]:
         )
     missing = missing_ticks(recording)
     if missing:
-        text = f"not recorded ({missing} {'tick' if missing == 1 else 'ticks'})"
+        text = f"not recorded ({ticks_in_words(missing)})"
         handles.append(Patch(color=MISSING, label=text))
     for name, times in breaks(recording).items():
         when = ", ".join(f"{at:g} s" for at in times[:3]) + (", ..." if len(times) > 3 else "")
         text = f"{name.replace('_', ' ')} at {when}"
         handles.append(Line2D([], [], color=PURPLE, linestyle=(0, (3, 1.5)), label=text))
     return handles
+
+
+def ticks_in_words(ticks: int) -> str:
+    """So many ticks."""
+    return "1 tick" if ticks == 1 else f"{ticks} ticks"
 
 
 def missing_ticks(recording: Recording) -> int:
@@ -199,6 +209,7 @@ def image(ax: Any, recording: Recording, values: Array, label: str) -> None:
     ax.figure.colorbar(mesh, ax=ax, label=label, pad=0.02, extend=extend)
     ax.set_ylabel("arclength from root [m]")
     over_time(ax, recording)
+    ax.set_xlim(0.0, edges[-1])
 
 
 def scaled(values: Array, unit: str) -> tuple[Array, str]:

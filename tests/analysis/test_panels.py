@@ -251,6 +251,25 @@ def test_late_ticks_gains_and_events_are_marked_on_axes_of_time(path: Path) -> N
     ]
 
 
+def test_what_ended_the_run_is_marked_at_the_end_and_told_with_its_time(held: Path) -> None:
+    """The stop came some ticks after the last one that every node and the plant have told of."""
+    recording = read_recording(held)
+    columns = recording.tables["/event"].columns
+    stopped = {
+        **columns,
+        "tick": np.array([TICKS + 4]),
+        "name": np.array(["safety_stop"], dtype=object),
+    }
+    tables = {**recording.tables, "/event": Table("/event", stopped)}
+    figure = draw(
+        dataclasses.replace(recording, tables=tables), Choice(("energy",)), lambda _: None
+    )
+    (ax,) = figure.axes
+    assert any(np.allclose(line.get_xdata(), 0.1 * TICKS) for line in ax.lines)
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["safety stop at 15.4 s"]
+
+
 def test_a_sound_run_needs_no_key(held: Path) -> None:
     assert not draw(read_recording(held), Choice(("tip",)), lambda _: None).legends
 
