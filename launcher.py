@@ -14,7 +14,7 @@ import tyro
 
 from supervise.entry import serve, show_json, teller
 from supervise.options import RunOptions
-from supervise.recording_verbs import animate, diff, export, replay
+from supervise.recording_verbs import animate, diff, export, plot, replay
 from supervise.shipped import DEFAULT_ARM, DEFAULT_GAINS
 from wire.errors import ExitCode, UsageError
 
@@ -423,6 +423,7 @@ VERBS: dict[str, Callable[..., int]] = {
     "design": design,
     "solve": solve,
     "deploy": deploy,
+    "plot": plot,
     "animate": animate,
     "diff": diff,
     "export": export,

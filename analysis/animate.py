@@ -1,13 +1,14 @@
-"""The film of a run: a GIF of the arm in the plane, from a recording.
+"""The film of a run: a GIF or MP4 of the arm in the plane, from a recording.
 
-Last step of the analysis: recording in, GIF out. The pictures are `analysis.scene`'s; here are the
-choice of ticks, the common palette, which keeps the file small, and the writing.
+Last step of the analysis: recording in, film out. The pictures are `analysis.scene`'s; here are the
+choice of ticks, and for the GIF the common palette, which keeps the file small, and the writing;
+`analysis.mp4` writes the other kind.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -17,6 +18,7 @@ import numpy as np
 from PIL import Image
 
 from analysis.goals import active_setpoints
+from analysis.mp4 import even, find_ffmpeg, write_mp4
 from analysis.recording import Recording, find_recording, read_recording
 from analysis.scene import Pixels, Scene
 from analysis.whole_file import check_free, whole
@@ -24,6 +26,8 @@ from wire.errors import UsageError
 
 FILM_S = 10.0
 """Length of the film if no speed is given."""
+KINDS = {".gif": 50.0, ".mp4": 60.0}
+"""Kinds of film and the most frames a second: a GIF counts hundredths of a second, viewers skip single ones."""
 MOST_FRAMES = 3000
 COLOURS, EXACT = 64, 24
 """Of the palette that all frames share; so many of them are the pictures' most frequent ones."""
@@ -38,14 +42,16 @@ class Film:
     """How to show a run. Raises UsageError, naming the option, for what cannot be shown."""
 
     fps: float = 15.0
-    """Frames a second; a GIF counts hundredths of a second, so 50 at most."""
+    """Frames a second; `KINDS` has how many there can be."""
     speed: float | None = None
     """Seconds of the arm's time in a second of the film; default: such that it lasts 10 s."""
     width_px: int = 480
 
     def __post_init__(self) -> None:
-        if not 0.5 <= self.fps <= 50.0:
-            raise UsageError(f"--fps: expected 0.5 to 50 frames a second, got {self.fps:g}")
+        if not 0.5 <= self.fps <= max(KINDS.values()):
+            raise UsageError(
+                f"--fps: expected 0.5 to {max(KINDS.values()):g} frames a second, got {self.fps:g}"
+            )
         if self.speed is not None and not (math.isfinite(self.speed) and self.speed > 0.0):
             raise UsageError(f"--speed: expected a positive number, got {self.speed:g}")
         if not 240 <= self.width_px <= 1920:
@@ -60,15 +66,16 @@ def animate(
     *,
     force: bool = False,
 ) -> dict[str, Any]:
-    """Make the GIF of a recording (or of the run's directory that holds it); facts for --json.
+    """Make the film of a recording (or of the run's directory that holds it); facts for --json.
 
     `out` None is arm.gif beside the recording. The file appears whole or not at all. Raises UsageError
-    if the recording cannot be read or has nothing to draw, if `out` is no .gif, exists (without
-    `force`) or cannot be written.
+    if the recording cannot be read or has nothing to draw, if `out` is neither .gif nor .mp4, exists
+    (without `force`) or cannot be written, or if ffmpeg is needed and is not there or fails.
     """
     path = find_recording(path)
     out = path.with_name("arm.gif") if out is None else out
-    _check_target(out, force)
+    _check_kind(out, film)
+    check_free(out, force=force)
     recording = read_recording(path)
     drawable = np.flatnonzero(np.isfinite(recording.shapes_m).all(axis=(1, 2)))
     if drawable.size < 2:
@@ -80,13 +87,18 @@ def animate(
     ticks = sorted({int(drawable[np.abs(drawable - k).argmin()]) for k in ticks})
     with whole(out, force=force) as growing:
         scene = Scene(recording, ticks, film.width_px, f"{speed:g} x real time")
-        frames = _frames(scene, ticks, Palette(_sample(recording, scene, ticks)), progress)
-        _write(growing, frames, film.fps)
-    width, height = scene.size
+        width, height = scene.size
+        pictures = _pictures(scene, ticks, progress)
+        if out.suffix.lower() == ".mp4":
+            width, height = width + width % 2, height + height % 2
+            write_mp4(growing, map(even, pictures), (width, height), film.fps, out)
+        else:
+            palette = Palette(_sample(recording, scene, ticks))
+            _write_gif(growing, [palette.indexed(pixels) for pixels in pictures], film.fps)
     return {
         "animation": str(out),
         "recording": str(path),
-        "frames": len(frames),
+        "frames": len(ticks),
         "fps": film.fps,
         "speed": speed,
         "width_px": width,
@@ -121,10 +133,16 @@ def choose_ticks(recording: Recording, film: Film) -> tuple[float, list[int]]:
     return speed, sorted({*(round(i * step) for i in range(count)), last})
 
 
-def _check_target(out: Path, force: bool) -> None:
-    if out.suffix.lower() != ".gif":
-        raise UsageError(f"--out {out}: expected a name that ends in .gif, the only kind of film")
-    check_free(out, force=force)
+def _check_kind(out: Path, film: Film) -> None:
+    kind = out.suffix.lower()
+    if kind not in KINDS:
+        raise UsageError(f"--out {out}: expected a name that ends in .gif or .mp4")
+    if film.fps > KINDS[kind]:
+        raise UsageError(
+            f"--fps: expected 0.5 to {KINDS[kind]:g} frames a second for {kind}, got {film.fps:g}"
+        )
+    if kind == ".mp4":
+        find_ffmpeg(out)
 
 
 class Palette:
@@ -162,20 +180,18 @@ def _sample(recording: Recording, scene: Scene, ticks: Sequence[int]) -> Pixels:
     return np.concatenate([scene.draw(k) for k in sorted({*firsts, ticks[0], ticks[-1]})])
 
 
-def _frames(
-    scene: Scene, ticks: Sequence[int], palette: Palette, progress: Callable[[str], None]
-) -> list[Image.Image]:
+def _pictures(
+    scene: Scene, ticks: Sequence[int], progress: Callable[[str], None]
+) -> Iterator[Pixels]:
     said = monotonic()
-    frames = []
     for i, tick in enumerate(ticks):
         if monotonic() - said > SAY_EVERY_S:
             said = monotonic()
             progress(f"frame {i} of {len(ticks)}")
-        frames.append(palette.indexed(scene.draw(tick)))
-    return frames
+        yield scene.draw(tick)
 
 
-def _write(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
+def _write_gif(path: Path, frames: Sequence[Image.Image], fps: float) -> None:
     each = max(20, 10 * round(100.0 / fps))  # ms, in the hundredths that a GIF counts
     durations = [each] * (len(frames) - 1) + [max(each, round(1e3 * LAST_S))]
     frames[0].save(

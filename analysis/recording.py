@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 
 import msgspec
@@ -44,6 +43,20 @@ QUANTITIES = (*STATE, *COMMAND)
 """What a node computes each tick, in the order of the dense step's output."""
 _FLOW = ("messages", "bytes", "crc32")
 _ENDINGS = ("finished", "interrupted", "safety_stop")
+
+
+@dataclass(frozen=True)
+class Link:
+    """One direction between two neighbours, by the final counters of both."""
+
+    way: str
+    """"forward" or "backward"."""
+    sender: int
+    receiver: int
+    sent: int
+    received: int
+    intact: bool
+    """Both ends agree in number, bytes and checksum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,22 +234,47 @@ class Recording:
             return None
         return sum(one.get(name, 0) for one in counts)
 
-    def intact_links(self) -> int | None:
-        """Directed links between neighbours whose two ends saw the same bytes in the same order.
+    def links(self) -> list[Link] | None:
+        """Directed links between neighbours in different processes, forward ones first, each from the root on.
 
-        2 (n - 1) if everything that was sent arrived unaltered (with p processes 2 (p - 1)); None unless every
-        node has sent its counters.
+        None unless every node has sent its counters.
         """
         counts = [self.process_counters(f"node/{self._label(i)}") for i in self._indices]
         if not all(counts):
             return None
-        pairs = [("forward", a, b) for a, b in pairwise(counts)]
-        pairs += [("backward", b, a) for a, b in pairwise(counts)]
-        return sum(
-            all(a[f"{way}_sent_{what}"] == b.get(f"{way}_received_{what}") for what in _FLOW)
+        pairs = [("forward", i, i + 1) for i in range(self.nodes - 1)]
+        pairs += [("backward", i + 1, i) for i in range(self.nodes - 1)]
+        return [
+            Link(
+                way,
+                a,
+                b,
+                counts[a][f"{way}_sent_messages"],
+                counts[b].get(f"{way}_received_messages", 0),
+                all(
+                    counts[a][f"{way}_sent_{what}"] == counts[b].get(f"{way}_received_{what}")
+                    for what in _FLOW
+                ),
+            )
             for way, a, b in pairs
-            if f"{way}_sent_messages" in a  # else both are in one process
-        )
+            if f"{way}_sent_messages" in counts[a]  # else both are in one process
+        ]
+
+    def intact_links(self) -> int | None:
+        """Links whose two ends saw the same bytes in the same order.
+
+        2 (n - 1) if everything that was sent arrived unaltered (with p processes 2 (p - 1)); None unless every
+        node has sent its counters.
+        """
+        links = self.links()
+        return None if links is None else sum(link.intact for link in links)
+
+    def sweeps(self) -> int | None:
+        """Ticks that had a sweep, by the final counters; None unless every node has sent its own."""
+        done = self.counter("ticks_recorded")
+        if done is None or self.counter("nodes_reporting") != self.nodes:
+            return None
+        return done - (self.counter("late_ticks") or 0)
 
     def ending(self) -> str | None:
         """How the run ended: "finished", "interrupted", "safety_stop"; None if it does not say."""

@@ -138,16 +138,12 @@ def _finite(value: Any) -> Any:
 
 def _traffic(recording: Recording) -> dict[str, Any]:
     """Message counts of the final counters; null without them."""
-    nodes = recording.nodes
     neighbours = recording.counter("neighbour_messages")
     size = recording.counter("neighbour_bytes")
-    reporting = recording.counter("nodes_reporting")
-    done = recording.counter("ticks_recorded") if reporting == nodes else None
-    if done is not None:
-        done -= recording.counter("late_ticks") or 0
+    done = recording.sweeps()
     return {
         "node_processes": len(recording.configuration.firsts),
-        "nodes_reporting": reporting,
+        "nodes_reporting": recording.counter("nodes_reporting"),
         "neighbour_messages": neighbours,
         "neighbour_messages_sent": recording.counter("neighbour_messages_sent"),
         "neighbour_messages_per_tick": _ratio(neighbours, done),

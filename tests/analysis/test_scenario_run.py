@@ -12,7 +12,8 @@ from simulated_run import Scenario, make_artefact, write_recording
 from analysis.estimated_arm import estimated_arms
 from analysis.goals import active_setpoints, colour, reference_tips
 from analysis.open_loop import compare_with_open_loop
-from analysis.plot import draw_run, runs_of
+from analysis.panels.frame import runs_of
+from analysis.plot import draw_run
 from analysis.recording import Recording, read_recording
 from analysis.render import render
 from analysis.scene import Scene

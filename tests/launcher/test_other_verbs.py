@@ -77,7 +77,18 @@ def test_doctor_exchanges_messages_over_zenoh(start: Start) -> None:
 def test_help_names_verbs_and_options(start: Start) -> None:
     cli = start("--help")
     assert cli.finish() == 0
-    for verb in ("run", "design", "deploy", "animate", "diff", "export", "study", "doctor"):
+    for verb in (
+        "run",
+        "design",
+        "deploy",
+        "plot",
+        "animate",
+        "replay",
+        "diff",
+        "export",
+        "study",
+        "doctor",
+    ):
         assert verb in cli.out
     options = start("run", "--help")
     assert options.finish() == 0

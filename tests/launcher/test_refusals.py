@@ -76,7 +76,8 @@ def test_wrong_option(
 
 
 @pytest.mark.parametrize(
-    "verb", [["deploy", "--out"], ["animate"], ["diff", "a"], ["export", "--csv"]]
+    "verb",
+    [["deploy", "--out"], ["animate"], ["plot"], ["replay"], ["diff", "a"], ["export", "--csv"]],
 )
 def test_a_name_that_is_too_long_for_a_file(
     verb: list[str], capfd: pytest.CaptureFixture[str]
