@@ -6,11 +6,8 @@ choice of ticks, the common palette, which keeps the file small, and the writing
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -20,8 +17,9 @@ import numpy as np
 from PIL import Image
 
 from analysis.goals import active_setpoints
-from analysis.recording import Recording, read_recording
+from analysis.recording import Recording, find_recording, read_recording
 from analysis.scene import Pixels, Scene
+from analysis.whole_file import check_free, whole
 from wire.errors import UsageError
 
 FILM_S = 10.0
@@ -68,7 +66,7 @@ def animate(
     if the recording cannot be read or has nothing to draw, if `out` is no .gif, exists (without
     `force`) or cannot be written.
     """
-    path = path / "recording.mcap" if path.is_dir() else path
+    path = find_recording(path)
     out = path.with_name("arm.gif") if out is None else out
     _check_target(out, force)
     recording = read_recording(path)
@@ -80,7 +78,7 @@ def animate(
         )
     speed, ticks = choose_ticks(recording, film)
     ticks = sorted({int(drawable[np.abs(drawable - k).argmin()]) for k in ticks})
-    with _whole(out, force) as growing:
+    with whole(out, force=force) as growing:
         scene = Scene(recording, ticks, film.width_px, f"{speed:g} x real time")
         frames = _frames(scene, ticks, Palette(_sample(recording, scene, ticks)), progress)
         _write(growing, frames, film.fps)
@@ -126,32 +124,7 @@ def choose_ticks(recording: Recording, film: Film) -> tuple[float, list[int]]:
 def _check_target(out: Path, force: bool) -> None:
     if out.suffix.lower() != ".gif":
         raise UsageError(f"--out {out}: expected a name that ends in .gif, the only kind of film")
-    if out.is_dir():
-        raise UsageError(f"--out {out}: that is a directory; give the name of a file")
-    if out.exists() and not force:
-        raise UsageError(f"--out {out}: it exists already; give another name or --force")
-
-
-@contextlib.contextmanager
-def _whole(out: Path, force: bool) -> Iterator[Path]:
-    """A file beside `out` that takes its place when all has gone well, and goes away if not."""
-    try:
-        handle, name = tempfile.mkstemp(dir=out.parent, prefix=f".{out.stem}-", suffix=".gif")
-        os.close(handle)
-    except OSError as error:
-        raise UsageError(
-            f"--out {out}: {error.strerror or error}; give a place that can be written"
-        ) from None
-    growing = Path(name)
-    try:
-        yield growing
-        growing.chmod(0o644)
-        _check_target(out, force)  # somebody else may have been quicker
-        growing.replace(out)
-    except OSError as error:
-        raise UsageError(f"--out {out}: {error.strerror or error}") from None
-    finally:
-        growing.unlink(missing_ok=True)
+    check_free(out, force=force)
 
 
 class Palette:

@@ -253,6 +253,11 @@ class Recording:
         return np.stack([self.table(t).by_tick(fields, self.ticks) for t in topics], axis=1)
 
 
+def find_recording(path: Path) -> Path:
+    """The recording itself, given it or the run's directory that holds it."""
+    return path / "recording.mcap" if path.is_dir() else path
+
+
 def read_recording(path: Path) -> Recording:
     """Read the recording of a run, also one that was cut short.
 

@@ -1,0 +1,426 @@
+"""The records of an MCAP file in file order, of a whole file and of what is left of one.
+
+First step of everything that reads a recording: `analysis.mcap_file` takes its messages up to the first damage,
+`analysis.survey` counts what is there, `analysis.recover` copies it. The framing (one byte of opcode, eight of
+length) is walked without the index at the end of the file, so that a file whose writer was killed gives
+everything up to its last whole record. The contents of the records are decoded by the mcap package.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import msgspec
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Footer, Header, Metadata, Schema
+from mcap.stream_reader import get_chunk_data_stream
+
+from wire.errors import UsageError
+
+MAGIC = b"\x89MCAP0\r\n"
+FRAME = struct.Struct("<BQ")
+MESSAGE = struct.Struct("<HIQQ")
+Message = tuple[int, int, int, int, int, memoryview]
+"""Offset of its record in the unpacked chunk, channel number, sequence, log time, publish time, payload. A
+plain tuple: there are hundreds of thousands."""
+Announcement: TypeAlias = Schema | Channel
+_CHUNK_HEAD = struct.Struct("<QQQII")
+_CHUNK_DATA = struct.Struct("<Q")
+_DECODING = (McapError, UnicodeDecodeError, struct.error)
+_PRIVATE = 0x80
+"""Opcodes from here on are other programs' own records, which a reader passes over."""
+_SIZES = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
+"""Records of one size: their opcodes decide where the reading ends."""
+_READ: dict[int, Callable[[ReadDataStream], Any]] = {
+    Opcode.HEADER: Header.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.METADATA: Metadata.read,
+}
+_KNOWN = frozenset(map(int, Opcode))
+_END_SIZE = FRAME.size + _SIZES[Opcode.FOOTER] + len(MAGIC)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One record of the file; a chunk comes with all that is in it."""
+
+    opcode: int
+    offset: int
+    size: int
+    """In the file, framing included."""
+    value: Any = None
+    """Header, metadata, attachment or chunk as the mcap package has it; None for other kinds."""
+    announced: tuple[Announcement, ...] = ()
+    """Schemas and channels that were not known before, in the order in which they must be written."""
+    messages: tuple[Message, ...] | list[Message] = ()
+    partial: bool = False
+    """Not all of the chunk's records are in `messages` and `announced`, or those are not all in the chunk."""
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Something in the file that cannot be used."""
+
+    offset: int
+    size: int
+    what: str
+    opcode: int
+    messages: int | None = None
+    """How many were in it, where that is known."""
+
+
+class _Cut(Exception):  # noqa: N818 - not an error of the program: the file simply ends here
+    """The data end in the middle of a record."""
+
+
+def read_bytes(path: Path) -> bytes:
+    """The content of an MCAP file. Raises UsageError if it cannot be opened or is none."""
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise UsageError(
+            f"recording {path}: {error.strerror or error}; "
+            "give the .mcap file that a run left behind"
+        ) from None
+    if not raw.startswith(MAGIC):
+        raise UsageError(
+            f"recording {path}: expected an MCAP file, got {len(raw)} bytes starting with "
+            f"{raw[:8]!r}; give the .mcap file that a run left behind"
+        )
+    return raw
+
+
+@dataclass
+class Walk:
+    """Iterate once: yields the pieces of the data section in file order, and the damages between them.
+
+    What the walk says of the whole file is there when the iteration has ended.
+    """
+
+    data: memoryview
+    channels: dict[int, Channel] = field(default_factory=dict)
+    """Announced so far."""
+    unfinished: str | None = None
+    """None if the file goes up to its end record and end mark, else where and how it stops."""
+    stopped_at: int = 0
+    """Offset of what could not be read any more, or of the end record."""
+    doubts: list[str] = field(default_factory=list)
+    """What is wrong with a file that is all there: checksums of its sections, its index."""
+    _schemas: dict[int, Schema] = field(default_factory=dict)
+    _repeated: tuple[dict[int, Schema], dict[int, Channel]] = field(
+        default_factory=lambda: ({}, {})
+    )
+    _waiting: Damage | None = None
+    """A damaged chunk: the indexes that follow it say how many messages were in it."""
+
+    def __iter__(self) -> Iterator[Piece | Damage]:
+        self._repeated = self._summary()
+        offset, opcode, ended = len(MAGIC), 0, False
+        while offset < len(self.data) and not ended:
+            self.stopped_at = offset
+            try:
+                opcode, end = _frame(self.data, offset)
+            except _Cut:
+                self.unfinished = f"ends in the middle of a record at byte {offset}"
+                yield from self._settle()
+                yield from self._cut(offset)
+                return
+            if self._misread(opcode, end - offset - FRAME.size):
+                what = f"a record of unknown kind {opcode}"
+                if not self._plausible(end):
+                    self.unfinished = f"is damaged at byte {offset} ({what})"
+                    yield from self._settle()
+                    yield Damage(offset, len(self.data) - offset, what, opcode)
+                    return
+                yield from self._settle()
+                yield Damage(offset, end - offset, what, opcode)
+            else:
+                yield from self._record(opcode, offset, end)
+                ended = opcode in _SIZES
+            offset = end
+        yield from self._settle()
+        self._ending(offset, complete=ended and opcode == Opcode.DATA_END)
+
+    # -- one record -------------------------------------------------------------------------------
+
+    def _record(self, opcode: int, offset: int, end: int) -> Iterator[Piece | Damage]:
+        content = self.data[offset + FRAME.size : end]
+        size = end - offset
+        if opcode == Opcode.MESSAGE_INDEX:
+            self._count(content)
+            yield Piece(opcode, offset, size)
+            return
+        yield from self._settle()
+        try:
+            if opcode == Opcode.CHUNK:
+                yield from self._chunk(content, offset, size)
+            elif opcode == Opcode.MESSAGE:
+                yield from self._taken(opcode, offset, size, [], [_message(content, 0)])
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                yield from self._taken(opcode, offset, size, [_decoded(opcode, content)], [])
+            elif opcode in _READ:
+                yield Piece(opcode, offset, size, _decoded(opcode, content))
+            else:
+                yield Piece(opcode, offset, size)
+        except _DECODING as error:
+            damage = Damage(offset, size, str(error) or type(error).__name__, opcode)
+            if opcode == Opcode.CHUNK:
+                self._waiting = damage
+            else:
+                yield damage
+
+    def _chunk(self, content: memoryview, offset: int, size: int) -> Iterator[Piece | Damage]:
+        chunk = Chunk.read(ReadDataStream(BytesIO(content)))
+        if len(content) != _CHUNK_HEAD.size + len(chunk.compression) + 8 + len(chunk.data):
+            raise McapError("a chunk whose lengths contradict each other")
+        announced, messages, rest = _split(_unpacked(chunk))
+        if rest:
+            raise McapError("a chunk that ends in the middle of a record")
+        verified = chunk.uncompressed_crc != 0
+        yield from self._taken(
+            Opcode.CHUNK, offset, size, announced, messages, chunk, verified=verified
+        )
+
+    def _taken(
+        self,
+        opcode: int,
+        offset: int,
+        size: int,
+        announced: list[Announcement],
+        messages: list[Message],
+        chunk: Chunk | None = None,
+        *,
+        verified: bool = False,
+        partial: bool = False,
+    ) -> Iterator[Piece | Damage]:
+        """The piece with those messages whose channel is known, and the others as damage."""
+        new = [one for one in announced if self._announce(one)]
+        partial |= len(new) < len(announced)
+        unknown = {m[1] for m in messages} - self.channels.keys()
+        if unknown or any(self._lacks_schema(one) for one in new):
+            more = self._from_summary(unknown, new)
+            new = sorted([*more, *new], key=lambda one: isinstance(one, Channel))
+            partial |= bool(more)
+            unknown -= self.channels.keys()
+        good = messages
+        if unknown:
+            good = [m for m in messages if m[1] not in unknown]
+        if not verified:
+            good = [m for m in good if self._parses(m)]
+        partial |= len(good) < len(messages)
+        yield Piece(opcode, offset, size, chunk, tuple(new), good, partial)
+        if lost := len(messages) - len(good):
+            what = (
+                f"a message of channel number {min(unknown)}, which was never announced"
+                if unknown
+                else "a message without a checksum that is not JSON"
+            )
+            yield Damage(offset, 0, what, Opcode.MESSAGE, lost)
+
+    def _announce(self, one: Announcement) -> bool:
+        """Whether it is new; a number that is announced again keeps its first meaning."""
+        known: dict[int, Any] = self.channels if isinstance(one, Channel) else self._schemas
+        if one.id in known:
+            return False
+        known[one.id] = one
+        return True
+
+    def _lacks_schema(self, one: Announcement) -> bool:
+        return (
+            isinstance(one, Channel) and one.schema_id != 0 and one.schema_id not in self._schemas
+        )
+
+    def _from_summary(
+        self, channels: set[int], announced: list[Announcement]
+    ) -> list[Announcement]:
+        """What is missing because a damaged chunk had it, from its repetition at the end of the file."""
+        schemas, repeated = self._repeated
+        found: list[Announcement] = [repeated[i] for i in sorted(channels) if i in repeated]
+        wanted = {one.schema_id for one in [*found, *announced] if isinstance(one, Channel)}
+        found = [*(schemas[i] for i in sorted(wanted) if i in schemas), *found]
+        return [one for one in found if self._announce(one)]
+
+    def _parses(self, message: Message) -> bool:
+        if self.channels[message[1]].message_encoding != "json":
+            return True
+        try:
+            msgspec.json.decode(message[5])
+        except (msgspec.DecodeError, UnicodeDecodeError):
+            return False
+        return True
+
+    # -- what is broken -----------------------------------------------------------------------------
+
+    def _misread(self, opcode: int, size: int) -> bool:
+        """Whether no record of this kind can be here."""
+        if opcode >= _PRIVATE:
+            return False
+        return opcode not in _KNOWN or _SIZES.get(opcode, size) != size
+
+    def _plausible(self, offset: int) -> bool:
+        """Whether a record begins here: then only the one before it is broken."""
+        try:
+            opcode, end = _frame(self.data, offset)
+        except _Cut:
+            return False
+        return opcode in _KNOWN and not self._misread(opcode, end - offset - FRAME.size)
+
+    def _cut(self, offset: int) -> Iterator[Piece | Damage]:
+        """The record in whose middle the file ends; of a chunk its first messages may be there."""
+        content = self.data[offset + FRAME.size :]
+        opcode = self.data[offset]
+        size = len(self.data) - offset
+        if opcode == Opcode.CHUNK:
+            try:
+                announced, messages, _ = _split(_begun(content))
+            except _DECODING:
+                announced, messages = [], []
+            if messages:
+                yield from self._taken(opcode, offset, 0, announced, messages, partial=True)
+        yield Damage(offset, size, "the record in which the file ends", opcode)
+
+    def _count(self, content: memoryview) -> None:
+        """A message index: its entries count the messages of the chunk before it."""
+        if self._waiting is not None and len(content) >= 6:
+            entries = (len(content) - 6) // 16
+            damage = self._waiting
+            total = (damage.messages or 0) + entries
+            self._waiting = Damage(damage.offset, damage.size, damage.what, damage.opcode, total)
+
+    def _settle(self) -> Iterator[Damage]:
+        if self._waiting is not None:
+            yield self._waiting
+            self._waiting = None
+
+    # -- the end of the file ------------------------------------------------------------------------
+
+    def _ending(self, offset: int, *, complete: bool) -> None:
+        """What follows the data section: end record, index, end mark."""
+        if not complete:
+            self.stopped_at = offset
+            self.unfinished = f"ends at byte {len(self.data)} without an end record"
+            return
+        if bytes(self.data[-len(MAGIC) :]) != MAGIC:
+            self.unfinished = f"ends at byte {len(self.data)} in the middle of its index"
+            return
+        wanted = int.from_bytes(self.data[self.stopped_at + FRAME.size :][:4], "little")
+        if wanted and zlib.crc32(self.data[: self.stopped_at]) != wanted:
+            self.doubts.append("the checksum of its data section does not fit")
+        if self._summary_start() is None:
+            self.doubts.append("the checksum of its index does not fit")
+
+    def _summary_start(self) -> int | None:
+        """Where schemas and channels are repeated, in a file that was closed properly and has a sound index."""
+        at = len(self.data) - _END_SIZE
+        if at < len(MAGIC) or bytes(self.data[-len(MAGIC) :]) != MAGIC:
+            return None
+        opcode, size = FRAME.unpack_from(self.data, at)
+        if (opcode, size) != (Opcode.FOOTER, _SIZES[Opcode.FOOTER]):
+            return None
+        footer = Footer.read(ReadDataStream(BytesIO(self.data[at + FRAME.size :])))
+        start = int(footer.summary_start) or at
+        if not len(MAGIC) <= start <= at:
+            return None
+        covered = self.data[start : at + FRAME.size + 16]
+        if footer.summary_crc and zlib.crc32(covered) != footer.summary_crc:
+            return None
+        return start
+
+    def _summary(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
+        """Schemas and channels as the end of the file repeats them; empty if that cannot be used."""
+        start = self._summary_start()
+        if start is None:
+            return {}, {}
+        try:
+            announced, _, _ = _split(self.data[start : len(self.data) - len(MAGIC)])
+        except _DECODING:
+            return {}, {}
+        schemas = {one.id: one for one in announced if isinstance(one, Schema)}
+        return schemas, {one.id: one for one in announced if isinstance(one, Channel)}
+
+
+def _frame(data: memoryview, offset: int) -> tuple[int, int]:
+    """Opcode and end of the record at `offset`; raises _Cut if it is not all there."""
+    if offset + FRAME.size > len(data):
+        raise _Cut
+    opcode, length = FRAME.unpack_from(data, offset)
+    end = offset + FRAME.size + length
+    if end > len(data):
+        raise _Cut
+    return opcode, end
+
+
+def _decoded(opcode: int, content: memoryview) -> Any:
+    """The record as the mcap package has it; McapError and others if that cannot be."""
+    if opcode == Opcode.ATTACHMENT and zlib.crc32(content[:-4]) != int.from_bytes(
+        content[-4:], "little"
+    ):
+        raise McapError("an attachment whose checksum does not fit")
+    stream = ReadDataStream(BytesIO(content))
+    value = _READ[opcode](stream)
+    if opcode == Opcode.METADATA and stream.count != len(content):
+        raise McapError("metadata whose lengths contradict each other")
+    return value
+
+
+def _message(content: memoryview, offset: int) -> Message:
+    return (offset, *MESSAGE.unpack_from(content), content[MESSAGE.size :])
+
+
+def _split(inside: memoryview) -> tuple[list[Announcement], list[Message], bool]:
+    """Schemas and channels, messages, and whether there is a rest that is no whole record."""
+    announced: list[Announcement] = []
+    messages: list[Message] = []
+    offset, size, head = 0, len(inside), FRAME.size
+    while offset + head <= size:
+        opcode, length = FRAME.unpack_from(inside, offset)
+        begin = offset + head
+        end = begin + length
+        if end > size:
+            break
+        if opcode == Opcode.MESSAGE:
+            if length < MESSAGE.size:
+                raise McapError("a message that is too short")
+            payload = inside[begin + MESSAGE.size : end]
+            messages.append((offset, *MESSAGE.unpack_from(inside, begin), payload))
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            announced.append(_decoded(opcode, inside[begin:end]))
+        offset = end
+    return announced, messages, offset < size
+
+
+def _unpacked(chunk: Chunk) -> memoryview:
+    """The records in a chunk; McapError if it cannot be unpacked or its checksum does not fit."""
+    try:
+        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    except Exception as error:  # each compression library has exceptions of its own
+        raise McapError(f"a chunk that cannot be unpacked: {error}") from None
+    return memoryview(stream.read(size))
+
+
+def _begun(content: memoryview) -> memoryview:
+    """What can be unpacked of a chunk whose end is missing.
+
+    zstd gives whole blocks only, of up to 128 KiB: nothing of a chunk that is smaller.
+    """
+    try:
+        length = _CHUNK_HEAD.unpack_from(content)[-1]
+        at = _CHUNK_HEAD.size + length
+        compression = bytes(content[_CHUNK_HEAD.size : at])
+        data = content[at + _CHUNK_DATA.size :]
+        if compression == b"zstd":
+            return memoryview(zstandard.ZstdDecompressor().decompressobj().decompress(data))
+    except (struct.error, zstandard.ZstdError):
+        return memoryview(b"")
+    return data if compression == b"" else memoryview(b"")
