@@ -14,7 +14,7 @@ import tyro
 
 from supervise.entry import serve, show_json, teller
 from supervise.options import RunOptions
-from supervise.recording_verbs import animate
+from supervise.recording_verbs import animate, info, recover
 from supervise.shipped import DEFAULT_ARM, DEFAULT_GAINS
 from wire.errors import ExitCode, UsageError
 
@@ -424,6 +424,8 @@ VERBS: dict[str, Callable[..., int]] = {
     "solve": solve,
     "deploy": deploy,
     "animate": animate,
+    "info": info,
+    "recover": recover,
     "study": study,
     "bench": bench,
     "doctor": doctor,

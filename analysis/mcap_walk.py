@@ -76,8 +76,8 @@ class Damage:
     size: int
     what: str
     opcode: int
-    messages: int | None = None
-    """How many were in it, where that is known."""
+    messages: int | None = 0
+    """How many were in it; None if that is not known."""
 
 
 class _Cut(Exception):  # noqa: N818 - not an error of the program: the file simply ends here
@@ -141,10 +141,10 @@ class Walk:
                 if not self._plausible(end):
                     self.unfinished = f"is damaged at byte {offset} ({what})"
                     yield from self._settle()
-                    yield Damage(offset, len(self.data) - offset, what, opcode)
+                    yield Damage(offset, len(self.data) - offset, what, opcode, None)
                     return
                 yield from self._settle()
-                yield Damage(offset, end - offset, what, opcode)
+                yield Damage(offset, end - offset, what, opcode, None)
             else:
                 yield from self._record(opcode, offset, end)
                 ended = opcode in _SIZES
@@ -174,17 +174,19 @@ class Walk:
             else:
                 yield Piece(opcode, offset, size)
         except _DECODING as error:
-            damage = Damage(offset, size, str(error) or type(error).__name__, opcode)
+            what = str(error) or type(error).__name__
             if opcode == Opcode.CHUNK:
-                self._waiting = damage
+                self._waiting = Damage(offset, size, what, opcode, None)
             else:
-                yield damage
+                yield Damage(offset, size, what, opcode)
 
     def _chunk(self, content: memoryview, offset: int, size: int) -> Iterator[Piece | Damage]:
         chunk = Chunk.read(ReadDataStream(BytesIO(content)))
         if len(content) != _CHUNK_HEAD.size + len(chunk.compression) + 8 + len(chunk.data):
             raise McapError("a chunk whose lengths contradict each other")
-        announced, messages, rest = _split(_unpacked(chunk))
+        inside = _unpacked(chunk)
+        chunk.uncompressed_size = len(inside)  # has no checksum of its own
+        announced, messages, rest = _split(inside)
         if rest:
             raise McapError("a chunk that ends in the middle of a record")
         verified = chunk.uncompressed_crc != 0
@@ -288,7 +290,7 @@ class Walk:
                 announced, messages = [], []
             if messages:
                 yield from self._taken(opcode, offset, 0, announced, messages, partial=True)
-        yield Damage(offset, size, "the record in which the file ends", opcode)
+        yield Damage(offset, size, "the record in which the file ends", opcode, None)
 
     def _count(self, content: memoryview) -> None:
         """A message index: its entries count the messages of the chunk before it."""
