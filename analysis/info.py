@@ -132,6 +132,7 @@ def _file(found: Survey) -> dict[str, Any]:
         "closed": found.closed,
         "stops": found.stops,
         "stopped_at": None if found.unfinished is None else found.stopped_at,
+        "lost_bytes": found.lost_bytes,
         "lost_messages": found.lost_messages,
         "damages": [
             {"offset": d.offset, "bytes": d.size, "what": d.what, "messages": d.messages}

@@ -84,8 +84,9 @@ def _state(facts: Mapping[str, Any]) -> str:
     """Whether the file is whole; if not, where it stops and what to do."""
     file = facts["file"]
     if not file["closed"]:
-        more = [d for d in file["damages"] if d["messages"]]
-        lost = f"; {sum(d['messages'] for d in more)} messages cannot be read" if more else ""
+        lost = f" ({file['lost_messages']} messages)" if file["lost_messages"] else ""
+        if file["lost_bytes"]:
+            lost = f"; {file['lost_bytes']} of {file['bytes']} bytes cannot be read{lost}"
         return (
             f"NOT WHOLE: it {file['stops']}{lost}; `octarm recover` makes a file of what is there"
         )

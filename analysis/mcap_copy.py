@@ -31,8 +31,9 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from analysis.mcap_walk import FRAME, MAGIC, Announcement, Piece
-from analysis.mcap_walk import Message as Walked
+from analysis.mcap_records import FRAME, MAGIC, Announcement
+from analysis.mcap_records import Message as Walked
+from analysis.mcap_walk import Piece
 
 
 class McapCopy:

@@ -12,7 +12,8 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata
 
-from analysis.mcap_walk import Damage, Piece, Walk, read_bytes
+from analysis.mcap_records import read_bytes
+from analysis.mcap_walk import Damage, Piece, Walk
 
 
 @dataclass(frozen=True)

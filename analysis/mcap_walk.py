@@ -1,52 +1,45 @@
 """The records of an MCAP file in file order, of a whole file and of what is left of one.
 
 First step of everything that reads a recording: `analysis.mcap_file` takes its messages up to the first damage,
-`analysis.survey` counts what is there, `analysis.recover` copies it. The framing (one byte of opcode, eight of
-length) is walked without the index at the end of the file, so that a file whose writer was killed gives
-everything up to its last whole record. The contents of the records are decoded by the mcap package.
+`analysis.survey` counts what is there, `analysis.recover` copies it. The framing is walked without the index at
+the end of the file, so that a file whose writer was killed gives everything up to its last whole record.
 """
 
 from __future__ import annotations
 
-import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
-from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import msgspec
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Footer, Header, Metadata, Schema
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.records import Channel, Chunk, Footer, Schema
 
-from wire.errors import UsageError
+from analysis.mcap_records import (
+    DECODING,
+    FRAME,
+    MAGIC,
+    READ,
+    Announcement,
+    CutError,
+    Message,
+    begun,
+    chunk_of,
+    decoded,
+    frame,
+    message,
+    split,
+    unpacked,
+)
 
-MAGIC = b"\x89MCAP0\r\n"
-FRAME = struct.Struct("<BQ")
-MESSAGE = struct.Struct("<HIQQ")
-Message = tuple[int, int, int, int, int, memoryview]
-"""Offset of its record in the unpacked chunk, channel number, sequence, log time, publish time, payload. A
-plain tuple: there are hundreds of thousands."""
-Announcement: TypeAlias = Schema | Channel
-_CHUNK_HEAD = struct.Struct("<QQQII")
-_CHUNK_DATA = struct.Struct("<Q")
-_DECODING = (McapError, UnicodeDecodeError, struct.error)
 _PRIVATE = 0x80
 """Opcodes from here on are other programs' own records, which a reader passes over."""
 _SIZES = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
 """Records of one size: their opcodes decide where the reading ends."""
-_READ: dict[int, Callable[[ReadDataStream], Any]] = {
-    Opcode.HEADER: Header.read,
-    Opcode.SCHEMA: Schema.read,
-    Opcode.CHANNEL: Channel.read,
-    Opcode.ATTACHMENT: Attachment.read,
-    Opcode.METADATA: Metadata.read,
-}
 _KNOWN = frozenset(map(int, Opcode))
 _END_SIZE = FRAME.size + _SIZES[Opcode.FOOTER] + len(MAGIC)
 
@@ -80,27 +73,6 @@ class Damage:
     """How many were in it; None if that is not known."""
 
 
-class _Cut(Exception):  # noqa: N818 - not an error of the program: the file simply ends here
-    """The data end in the middle of a record."""
-
-
-def read_bytes(path: Path) -> bytes:
-    """The content of an MCAP file. Raises UsageError if it cannot be opened or is none."""
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        raise UsageError(
-            f"recording {path}: {error.strerror or error}; "
-            "give the .mcap file that a run left behind"
-        ) from None
-    if not raw.startswith(MAGIC):
-        raise UsageError(
-            f"recording {path}: expected an MCAP file, got {len(raw)} bytes starting with "
-            f"{raw[:8]!r}; give the .mcap file that a run left behind"
-        )
-    return raw
-
-
 @dataclass
 class Walk:
     """Iterate once: yields the pieces of the data section in file order, and the damages between them.
@@ -130,8 +102,8 @@ class Walk:
         while offset < len(self.data) and not ended:
             self.stopped_at = offset
             try:
-                opcode, end = _frame(self.data, offset)
-            except _Cut:
+                opcode, end = frame(self.data, offset)
+            except CutError:
                 self.unfinished = f"ends in the middle of a record at byte {offset}"
                 yield from self._settle()
                 yield from self._cut(offset)
@@ -166,14 +138,14 @@ class Walk:
             if opcode == Opcode.CHUNK:
                 yield from self._chunk(content, offset, size)
             elif opcode == Opcode.MESSAGE:
-                yield from self._taken(opcode, offset, size, [], [_message(content, 0)])
+                yield from self._taken(opcode, offset, size, [], [message(content, 0)])
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                yield from self._taken(opcode, offset, size, [_decoded(opcode, content)], [])
-            elif opcode in _READ:
-                yield Piece(opcode, offset, size, _decoded(opcode, content))
+                yield from self._taken(opcode, offset, size, [decoded(opcode, content)], [])
+            elif opcode in READ:
+                yield Piece(opcode, offset, size, decoded(opcode, content))
             else:
                 yield Piece(opcode, offset, size)
-        except _DECODING as error:
+        except DECODING as error:
             what = str(error) or type(error).__name__
             if opcode == Opcode.CHUNK:
                 self._waiting = Damage(offset, size, what, opcode, None)
@@ -181,12 +153,10 @@ class Walk:
                 yield Damage(offset, size, what, opcode)
 
     def _chunk(self, content: memoryview, offset: int, size: int) -> Iterator[Piece | Damage]:
-        chunk = Chunk.read(ReadDataStream(BytesIO(content)))
-        if len(content) != _CHUNK_HEAD.size + len(chunk.compression) + 8 + len(chunk.data):
-            raise McapError("a chunk whose lengths contradict each other")
-        inside = _unpacked(chunk)
+        chunk = chunk_of(content)
+        inside = unpacked(chunk)
         chunk.uncompressed_size = len(inside)  # has no checksum of its own
-        announced, messages, rest = _split(inside)
+        announced, messages, rest = split(inside)
         if rest:
             raise McapError("a chunk that ends in the middle of a record")
         verified = chunk.uncompressed_crc != 0
@@ -273,8 +243,8 @@ class Walk:
     def _plausible(self, offset: int) -> bool:
         """Whether a record begins here: then only the one before it is broken."""
         try:
-            opcode, end = _frame(self.data, offset)
-        except _Cut:
+            opcode, end = frame(self.data, offset)
+        except CutError:
             return False
         return opcode in _KNOWN and not self._misread(opcode, end - offset - FRAME.size)
 
@@ -285,8 +255,8 @@ class Walk:
         size = len(self.data) - offset
         if opcode == Opcode.CHUNK:
             try:
-                announced, messages, _ = _split(_begun(content))
-            except _DECODING:
+                announced, messages, _ = split(begun(content))
+            except DECODING:
                 announced, messages = [], []
             if messages:
                 yield from self._taken(opcode, offset, 0, announced, messages, partial=True)
@@ -345,84 +315,8 @@ class Walk:
         if start is None:
             return {}, {}
         try:
-            announced, _, _ = _split(self.data[start : len(self.data) - len(MAGIC)])
-        except _DECODING:
+            announced, _, _ = split(self.data[start : len(self.data) - len(MAGIC)])
+        except DECODING:
             return {}, {}
         schemas = {one.id: one for one in announced if isinstance(one, Schema)}
         return schemas, {one.id: one for one in announced if isinstance(one, Channel)}
-
-
-def _frame(data: memoryview, offset: int) -> tuple[int, int]:
-    """Opcode and end of the record at `offset`; raises _Cut if it is not all there."""
-    if offset + FRAME.size > len(data):
-        raise _Cut
-    opcode, length = FRAME.unpack_from(data, offset)
-    end = offset + FRAME.size + length
-    if end > len(data):
-        raise _Cut
-    return opcode, end
-
-
-def _decoded(opcode: int, content: memoryview) -> Any:
-    """The record as the mcap package has it; McapError and others if that cannot be."""
-    if opcode == Opcode.ATTACHMENT and zlib.crc32(content[:-4]) != int.from_bytes(
-        content[-4:], "little"
-    ):
-        raise McapError("an attachment whose checksum does not fit")
-    stream = ReadDataStream(BytesIO(content))
-    value = _READ[opcode](stream)
-    if opcode == Opcode.METADATA and stream.count != len(content):
-        raise McapError("metadata whose lengths contradict each other")
-    return value
-
-
-def _message(content: memoryview, offset: int) -> Message:
-    return (offset, *MESSAGE.unpack_from(content), content[MESSAGE.size :])
-
-
-def _split(inside: memoryview) -> tuple[list[Announcement], list[Message], bool]:
-    """Schemas and channels, messages, and whether there is a rest that is no whole record."""
-    announced: list[Announcement] = []
-    messages: list[Message] = []
-    offset, size, head = 0, len(inside), FRAME.size
-    while offset + head <= size:
-        opcode, length = FRAME.unpack_from(inside, offset)
-        begin = offset + head
-        end = begin + length
-        if end > size:
-            break
-        if opcode == Opcode.MESSAGE:
-            if length < MESSAGE.size:
-                raise McapError("a message that is too short")
-            payload = inside[begin + MESSAGE.size : end]
-            messages.append((offset, *MESSAGE.unpack_from(inside, begin), payload))
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            announced.append(_decoded(opcode, inside[begin:end]))
-        offset = end
-    return announced, messages, offset < size
-
-
-def _unpacked(chunk: Chunk) -> memoryview:
-    """The records in a chunk; McapError if it cannot be unpacked or its checksum does not fit."""
-    try:
-        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-    except Exception as error:  # each compression library has exceptions of its own
-        raise McapError(f"a chunk that cannot be unpacked: {error}") from None
-    return memoryview(stream.read(size))
-
-
-def _begun(content: memoryview) -> memoryview:
-    """What can be unpacked of a chunk whose end is missing.
-
-    zstd gives whole blocks only, of up to 128 KiB: nothing of a chunk that is smaller.
-    """
-    try:
-        length = _CHUNK_HEAD.unpack_from(content)[-1]
-        at = _CHUNK_HEAD.size + length
-        compression = bytes(content[_CHUNK_HEAD.size : at])
-        data = content[at + _CHUNK_DATA.size :]
-        if compression == b"zstd":
-            return memoryview(zstandard.ZstdDecompressor().decompressobj().decompress(data))
-    except (struct.error, zstandard.ZstdError):
-        return memoryview(b"")
-    return data if compression == b"" else memoryview(b"")

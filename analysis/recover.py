@@ -13,7 +13,8 @@ from typing import Any
 from mcap.records import Metadata
 
 from analysis.mcap_copy import McapCopy
-from analysis.mcap_walk import Damage, Walk, read_bytes
+from analysis.mcap_records import read_bytes
+from analysis.mcap_walk import Damage, Walk
 from analysis.survey import RECOVERED, Survey, configuration_of, survey_of, ticks_of
 from analysis.whole_file import check_free, whole
 from wire.channels import SUMMARY
@@ -26,8 +27,8 @@ def recover(path: Path, out: Path | None = None, *, force: bool = False) -> dict
     """Copy every whole record of a recording into a new file that is closed properly; facts for --json.
 
     `out` None is NAME.recovered.mcap beside the recording. A recording that was closed properly is left alone
-    (`recovered` is then None). Damaged chunks, and messages of channels that were never announced, are left out,
-    what follows them is kept; where the framing is broken the copy stops. Raises UsageError as
+    (`recovered` is then None). Damaged chunks, and messages of channels that were never announced, are left
+    out, what follows is kept; where the framing is broken the copy stops. Raises UsageError as
     `analysis.survey.survey` does, or if `out` exists (without `force`), is the recording or cannot be written.
     """
     out = path.with_name(path.stem + SUFFIX) if out is None else out
@@ -47,17 +48,19 @@ def recover(path: Path, out: Path | None = None, *, force: bool = False) -> dict
 def recover_text(facts: Mapping[str, Any]) -> str:
     """The facts of `recover` as a few lines."""
     if facts["recovered"] is None:
-        return f"{facts['recording']}: closed properly, {facts['kept']['messages']} messages; nothing to recover"
+        count = facts["kept"]["messages"]
+        return f"{facts['recording']}: closed properly, {count} messages; nothing to recover"
     kept, left_out = facts["kept"], facts["left_out"]
     last = "none" if facts["last_tick"] is None else facts["last_tick"]
     lost = "not known" if left_out["messages"] is None else left_out["messages"]
     end = "" if facts["has_summary"] else ", without the run's final counters"
     return "\n".join(
         [
-            f"{facts['recording']}: it {facts['stops']}, of {facts['bytes']} bytes",
+            f"{facts['recording']}: it {facts['stops']}",
             f"kept: {kept['messages']} messages in {kept['chunks']} chunks, {kept['attachments']} attachments, "
             f"{kept['metadata']} metadata records; last whole tick {last}",
-            f"left out: {left_out['records']} records, {left_out['bytes']} bytes; messages in them: {lost}",
+            f"left out: {left_out['records']} records, {left_out['bytes']} of {facts['bytes']} bytes; "
+            f"messages lost: {lost}",
             f"{facts['recovered']}: {facts['recovered_bytes']} bytes, closed properly{end}",
         ]
     )

@@ -14,7 +14,8 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 
-from analysis.mcap_walk import Damage, Piece, Walk, read_bytes
+from analysis.mcap_records import read_bytes
+from analysis.mcap_walk import Damage, Piece, Walk
 from analysis.recording import check_version, not_ours
 from wire.channels import METADATA, label
 from wire.errors import UsageError
@@ -101,11 +102,13 @@ class Survey:
     @property
     def stops(self) -> str | None:
         """Where the file stops or is damaged, in words; None if nothing is wrong with it."""
-        said = [self.unfinished] if self.unfinished else []
-        said += [f"is damaged at byte {d.offset} ({d.what})" for d in self.damages if d.size]
-        said = said[:1] if self.unfinished and len(said) == 2 else said
+        end = self.stopped_at if self.unfinished else -1  # the damage there is said already
+        said = [
+            f"is damaged at byte {d.offset} ({d.what})" for d in self.damages if d.offset != end
+        ]
+        said += [self.unfinished] if self.unfinished else []
         said += self.doubts
-        return "; ".join(said[:3]) + ("; ..." if len(said) > 3 else "") if said else None
+        return "; ".join([*said[:2], *(["..."] if len(said) > 3 else []), *said[2:][-1:]]) or None
 
     @property
     def lost_messages(self) -> int | None:
