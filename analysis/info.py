@@ -69,7 +69,7 @@ def info(path: Path) -> dict[str, Any]:
         "processes": None if run is None else process_rows(counters, run, notes),
         "events": events,
         "attachments": [dataclasses.asdict(one) for one in found.attachments],
-        "notes": notes,
+        "notes": list(dict.fromkeys(notes)),
     }
 
 

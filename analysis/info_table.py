@@ -250,7 +250,7 @@ def _processes(processes: Sequence[Mapping[str, Any]], *, every: bool) -> list[s
     lines = _columns(head, rows) if rows else []
     said = "all reported at the end"
     if silent:
-        whom = "none of them" if len(silent) == len(processes) else ", ".join(silent)
+        whom = "any of them" if len(silent) == len(processes) else ", ".join(silent)
         said = f"no final counters of {whom}"
     return [*lines, _fold(f"{len(processes)} processes under the launcher, {said}", "")]
 
