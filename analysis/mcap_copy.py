@@ -6,6 +6,7 @@ packs every message anew; here whole chunks are copied as they are, only indexes
 
 from __future__ import annotations
 
+import struct
 import zlib
 from collections.abc import Callable, Sequence
 from typing import Any, BinaryIO
@@ -23,7 +24,6 @@ from mcap.records import (
     Footer,
     Header,
     Message,
-    MessageIndex,
     Metadata,
     MetadataIndex,
     Schema,
@@ -173,16 +173,14 @@ class McapCopy:
                 ).write
             )
         )
-        indexes: dict[int, MessageIndex] = {}
+        places: dict[int, list[int]] = {}
         for at, channel, _, log_time, _, _ in messages:
-            if channel not in indexes:
-                indexes[channel] = MessageIndex(channel_id=channel, records=[])
-            indexes[channel].records.append((log_time, at))
+            places.setdefault(channel, []).extend((log_time, at))
         offsets, index_start = {}, self._offset
-        for channel, index in indexes.items():
+        for channel, pairs in places.items():
             offsets[channel] = self._offset
-            self._put(_bytes(index.write))
-            self._counts[channel] = self._counts.get(channel, 0) + len(index.records)
+            self._put(_index(channel, pairs))
+            self._counts[channel] = self._counts.get(channel, 0) + len(pairs) // 2
         self._chunks.append(
             ChunkIndex(
                 message_start_time=first,
@@ -258,6 +256,12 @@ class McapCopy:
         self._offset += len(data)
         self._checksum = zlib.crc32(data, self._checksum)
         return len(data)
+
+
+def _index(channel: int, pairs: Sequence[int]) -> bytes:
+    """A message index; `pairs` are log time and place in the chunk of each message. There are very many."""
+    body = struct.pack(f"<HI{len(pairs)}Q", channel, 8 * len(pairs), *pairs)
+    return FRAME.pack(Opcode.MESSAGE_INDEX, len(body)) + body
 
 
 def _bytes(write: Callable[[RecordBuilder], None]) -> bytes:

@@ -7,6 +7,7 @@ the end of the file, so that a file whose writer was killed gives everything up 
 
 from __future__ import annotations
 
+import dataclasses
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -40,13 +41,15 @@ _PRIVATE = 0x80
 """Opcodes from here on are other programs' own records, which a reader passes over."""
 _SIZES = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
 """Records of one size: their opcodes decide where the reading ends."""
+_INDEX_HEAD, _INDEX_ENTRY = 6, 16
+"""Bytes of a message index before its entries, and of an entry."""
 _KNOWN = frozenset(map(int, Opcode))
 _END_SIZE = FRAME.size + _SIZES[Opcode.FOOTER] + len(MAGIC)
 
 
 @dataclass(frozen=True)
 class Piece:
-    """One record of the file; a chunk comes with all that is in it."""
+    """One record of the file, or a chunk's indexes; a chunk comes with all that is in it."""
 
     opcode: int
     offset: int
@@ -108,7 +111,10 @@ class Walk:
                 yield from self._settle()
                 yield from self._cut(offset)
                 return
-            if self._misread(opcode, end - offset - FRAME.size):
+            if opcode == Opcode.MESSAGE_INDEX:
+                end = self._indexes(offset)
+                yield Piece(opcode, offset, end - offset)
+            elif self._misread(opcode, end - offset - FRAME.size):
                 what = f"a record of unknown kind {opcode}"
                 if not self._plausible(end):
                     self.unfinished = f"is damaged at byte {offset} ({what})"
@@ -129,10 +135,6 @@ class Walk:
     def _record(self, opcode: int, offset: int, end: int) -> Iterator[Piece | Damage]:
         content = self.data[offset + FRAME.size : end]
         size = end - offset
-        if opcode == Opcode.MESSAGE_INDEX:
-            self._count(content)
-            yield Piece(opcode, offset, size)
-            return
         yield from self._settle()
         try:
             if opcode == Opcode.CHUNK:
@@ -262,13 +264,22 @@ class Walk:
                 yield from self._taken(opcode, offset, 0, announced, messages, partial=True)
         yield Damage(offset, size, "the record in which the file ends", opcode, None)
 
-    def _count(self, content: memoryview) -> None:
-        """A message index: its entries count the messages of the chunk before it."""
-        if self._waiting is not None and len(content) >= 6:
-            entries = (len(content) - 6) // 16
-            damage = self._waiting
-            total = (damage.messages or 0) + entries
-            self._waiting = Damage(damage.offset, damage.size, damage.what, damage.opcode, total)
+    def _indexes(self, offset: int) -> int:
+        """The end of the message indexes that begin here; their entries count a damaged chunk's messages.
+
+        There are as many of them as channels in the chunk: together they are one piece.
+        """
+        data, size, entries = self.data, len(self.data), 0
+        while offset + FRAME.size <= size:
+            opcode, length = FRAME.unpack_from(data, offset)
+            end = offset + FRAME.size + length
+            if opcode != Opcode.MESSAGE_INDEX or end > size:
+                break
+            entries += max(0, length - _INDEX_HEAD) // _INDEX_ENTRY
+            offset = end
+        if self._waiting is not None:
+            self._waiting = dataclasses.replace(self._waiting, messages=entries)
+        return offset
 
     def _settle(self) -> Iterator[Damage]:
         if self._waiting is not None:
