@@ -18,7 +18,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
 
 from wire.errors import UsageError
 
@@ -127,6 +127,8 @@ def unpacked(chunk: Chunk) -> memoryview:
     """The records in a chunk; McapError if it cannot be unpacked or its checksum does not fit."""
     try:
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    except CRCValidationError:
+        raise McapError("a chunk whose checksum does not fit") from None
     except Exception as error:  # each compression library has exceptions of its own
         raise McapError(f"a chunk that cannot be unpacked: {error}") from None
     return memoryview(stream.read(size))
