@@ -22,10 +22,11 @@ from analysis.link_times import link_facts
 from analysis.recording import ENDINGS
 from analysis.survey import RECOVERED, Survey, configuration_of, survey, ticks_of
 from analysis.table import Table, decode_table
-from wire.channels import EVENTS, METADATA, PACE, SUMMARY, SWEEP_TIMING
+from wire.channels import METADATA, PACE, SUMMARY, SWEEP_TIMING
 from wire.errors import UsageError
 from wire.run_config import RunConfig
 
+EVENTS = "/event"
 LEVELS = {1: "debug", 2: "info", 3: "warning", 4: "error", 5: "fatal"}
 """Of an event, where it is a number."""
 _NUMBERS = re.compile(r"/\d+(?=/|$)")
@@ -43,9 +44,7 @@ def info(path: Path) -> dict[str, Any]:
     tables = {
         topic: table
         for topic, count in found.channels.items()
-        if count.payloads
-        and topic != EVENTS.topic
-        and (table := _table(topic, count.payloads, notes))
+        if count.payloads and topic != EVENTS and (table := _table(topic, count.payloads, notes))
     }
     counters = found.metadata.get(SUMMARY)
     ticks = None if run is None else ticks_of(found, run)
@@ -107,7 +106,7 @@ def channel_groups(channels: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]
 
 
 def _wanted(topic: str) -> bool:
-    return topic in (EVENTS.topic, "/plant/pace") or topic.endswith("/timing")
+    return topic in (EVENTS, "/plant/pace") or topic.endswith("/timing")
 
 
 def _table(topic: str, payloads: list[bytes], notes: list[str]) -> Table | None:
@@ -256,7 +255,7 @@ def _losses(counters: Mapping[str, str] | None, pace: Table | None) -> dict[str,
 
 
 def _events(found: Survey, run: RunConfig | None, notes: list[str]) -> list[dict[str, Any]]:
-    count = found.channels.get(EVENTS.topic)
+    count = found.channels.get(EVENTS)
     out = []
     for payload in (count and count.payloads) or []:
         try:

@@ -23,6 +23,8 @@ class McapContent:
     payloads: dict[str, list[bytes]]
     """Per topic the messages' payloads in file order; an announced topic may have none."""
     log_times_ns: dict[str, list[int]]
+    order: list[str]
+    """The topic of every message in file order."""
     metadata: dict[str, dict[str, str]]
     """Per name the last metadata record of that name."""
     attachments: dict[str, bytes]
@@ -35,20 +37,23 @@ class McapContent:
 class _Collector:
     payloads: dict[str, list[bytes]] = field(default_factory=dict)
     log_times_ns: dict[str, list[int]] = field(default_factory=dict)
+    order: list[str] = field(default_factory=list)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
-    sinks: dict[int, tuple[list[bytes], list[int]]] = field(default_factory=dict)
+    sinks: dict[int, tuple[str, list[bytes], list[int]]] = field(default_factory=dict)
 
     def take(self, piece: Piece) -> None:
         """Take one piece into the collection; those of no interest are dropped."""
         for one in piece.announced:
             if isinstance(one, Channel):
                 self.sinks[one.id] = (
+                    one.topic,
                     self.payloads.setdefault(one.topic, []),
                     self.log_times_ns.setdefault(one.topic, []),
                 )
         for _, channel, _, log_time, _, payload in piece.messages:
-            payloads, times = self.sinks[channel]
+            topic, payloads, times = self.sinks[channel]
+            self.order.append(topic)
             payloads.append(bytes(payload))
             times.append(log_time)
         if isinstance(piece.value, Metadata):
@@ -80,6 +85,7 @@ def read_mcap(path: Path) -> McapContent:
     return McapContent(
         payloads=collector.payloads,
         log_times_ns=collector.log_times_ns,
+        order=collector.order,
         metadata=collector.metadata,
         attachments=collector.attachments,
         bytes_read=len(raw),

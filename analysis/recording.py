@@ -255,7 +255,7 @@ class Recording:
 
 
 def find_recording(path: Path) -> Path:
-    """The recording itself, given it or the run's directory that holds it."""
+    """The recording that a user means: the file itself, or the one in the run's directory."""
     return path / "recording.mcap" if path.is_dir() else path
 
 

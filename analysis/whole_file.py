@@ -1,7 +1,4 @@
-"""An output file that appears whole or not at all, and never in place of another unasked.
-
-Last step of every verb that writes one file: film, copy of a recording.
-"""
+"""A file that appears whole or not at all and writes over nothing unasked: for what a verb leaves behind."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from wire.errors import UsageError
 
 
 def check_free(out: Path, *, force: bool) -> None:
-    """UsageError, naming --out, if a file could not be put there: a directory, or a file without `force`."""
+    """Raise UsageError if `out` is a directory, or exists and may not be written over."""
     if out.is_dir():
         raise UsageError(f"--out {out}: that is a directory; give the name of a file")
     if out.exists() and not force:
@@ -26,7 +23,7 @@ def check_free(out: Path, *, force: bool) -> None:
 def whole(out: Path, *, force: bool) -> Iterator[Path]:
     """A file beside `out` that takes its place when all has gone well, and goes away if not.
 
-    Raises UsageError, naming --out, if `out` is a directory, exists (without `force`) or cannot be written.
+    Raises UsageError if `out` exists (without `force`), is a directory or cannot be written.
     """
     check_free(out, force=force)
     try:
