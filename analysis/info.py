@@ -120,9 +120,11 @@ def _table(topic: str, payloads: list[bytes], notes: list[str]) -> Table | None:
 
 
 def _nothing_left_out(found: Survey) -> bool:
-    """Whether the file is no copy of a damaged one that had lost something."""
+    """Whether the file is no copy of a damaged one that had lost something or was altered."""
     said = found.metadata.get(RECOVERED, {})
-    return all(said.get(f"left_out_{what}", "0") == "0" for what in ("bytes", "messages"))
+    return not said.get("doubt") and all(
+        said.get(f"left_out_{what}", "0") == "0" for what in ("bytes", "messages")
+    )
 
 
 def _file(found: Survey) -> dict[str, Any]:

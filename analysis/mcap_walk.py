@@ -43,6 +43,7 @@ _SIZES = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
 """Records of one size: their opcodes decide where the reading ends."""
 _INDEX_HEAD, _INDEX_ENTRY = 6, 16
 """Bytes of a message index before its entries, and of an entry."""
+DATA_DOUBT = "has a data section whose checksum does not fit"
 _KNOWN = frozenset(map(int, Opcode))
 _END_SIZE = FRAME.size + _SIZES[Opcode.FOOTER] + len(MAGIC)
 
@@ -91,7 +92,7 @@ class Walk:
     stopped_at: int = 0
     """Offset of what could not be read any more, or of the end record."""
     doubts: list[str] = field(default_factory=list)
-    """What is wrong with a file that is all there: checksums of its sections, its index."""
+    """What is wrong with a file that is all there: checksums of its data section and its index."""
     _schemas: dict[int, Schema] = field(default_factory=dict)
     _repeated: tuple[dict[int, Schema], dict[int, Channel]] = field(
         default_factory=lambda: ({}, {})
@@ -299,9 +300,9 @@ class Walk:
             return
         wanted = int.from_bytes(self.data[self.stopped_at + FRAME.size :][:4], "little")
         if wanted and zlib.crc32(self.data[: self.stopped_at]) != wanted:
-            self.doubts.append("the checksum of its data section does not fit")
+            self.doubts.append(DATA_DOUBT)
         if self._summary_start() is None:
-            self.doubts.append("the checksum of its index does not fit")
+            self.doubts.append("has an index whose checksum does not fit")
 
     def _summary_start(self) -> int | None:
         """Where schemas and channels are repeated, in a file that was closed properly and has a sound index."""

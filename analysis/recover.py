@@ -14,7 +14,7 @@ from mcap.records import Metadata
 
 from analysis.mcap_copy import McapCopy
 from analysis.mcap_records import read_bytes
-from analysis.mcap_walk import Damage, Walk
+from analysis.mcap_walk import DATA_DOUBT, Damage, Walk
 from analysis.survey import RECOVERED, Survey, configuration_of, survey_of, ticks_of
 from analysis.whole_file import check_free, whole
 from wire.channels import SUMMARY
@@ -52,15 +52,20 @@ def recover_text(facts: Mapping[str, Any]) -> str:
         return f"{facts['recording']}: closed properly, {count} messages; nothing to recover"
     kept, left_out = facts["kept"], facts["left_out"]
     last = "none" if facts["last_tick"] is None else facts["last_tick"]
-    lost = "not known" if left_out["messages"] is None else left_out["messages"]
+    lost = "unknown" if left_out["messages"] is None else left_out["messages"]
+    without = "nothing"
+    if left_out["bytes"] or lost:
+        without = (
+            f"{left_out['records']} records, {left_out['bytes']} of {facts['bytes']} bytes; "
+            f"messages lost: {lost}"
+        )
     end = "" if facts["has_summary"] else ", without the run's final counters"
     return "\n".join(
         [
             f"{facts['recording']}: it {facts['stops']}",
             f"kept: {kept['messages']} messages in {kept['chunks']} chunks, {kept['attachments']} attachments, "
             f"{kept['metadata']} metadata records; last whole tick {last}",
-            f"left out: {left_out['records']} records, {left_out['bytes']} of {facts['bytes']} bytes; "
-            f"messages lost: {lost}",
+            f"left out: {without}",
             f"{facts['recovered']}: {facts['recovered_bytes']} bytes, closed properly{end}",
         ]
     )
@@ -83,6 +88,7 @@ def _copy(data: memoryview, copy: McapCopy, found: Survey) -> None:
         "left_out_messages": "unknown" if lost is None else lost,
         "left_out_records": _records(found),
         "left_out_bytes": found.lost_bytes,
+        "doubt": DATA_DOUBT if DATA_DOUBT in found.doubts else "",
         "octarm": _version(),
     }
     copy.add_metadata(Metadata(name=RECOVERED, metadata={k: str(v) for k, v in said.items()}))

@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 
 from analysis.mcap_records import read_bytes
-from analysis.mcap_walk import Damage, Piece, Walk
+from analysis.mcap_walk import DATA_DOUBT, Damage, Piece, Walk
 from analysis.recording import check_version, not_ours
 from wire.channels import METADATA, label
 from wire.errors import UsageError
@@ -161,7 +161,8 @@ def survey_of(path: Path, raw: bytes, wanted: Callable[[str], bool] = lambda _: 
                 names[one.id] = one
                 found.schemas += 1
         _count(piece, sinks)
-    found.doubts = walk.doubts
+    # Where a damage was found, the whole section's checksum has nothing to add.
+    found.doubts = [d for d in walk.doubts if d != DATA_DOUBT or not found.damages]
     found.unfinished = walk.unfinished
     found.stopped_at = walk.stopped_at
     if walk.unfinished is None:

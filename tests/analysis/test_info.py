@@ -15,12 +15,12 @@ import pytest
 from container import Anatomy, check_container
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Metadata
 from mcap.writer import CompressionType, Writer
 from simulated_run import Scenario, write_recording
 
 from analysis.info import channel_groups, info
 from analysis.info_table import MOST_EVENTS, info_table
+from analysis.recover import recover
 from wire.errors import UsageError
 
 DATA = Path(__file__).parents[1] / "data"
@@ -327,25 +327,19 @@ def test_json_is_one_object_and_lines_are_not_too_long(
     assert max(map(len, text.splitlines())) <= 118
 
 
-def test_a_checksum_over_the_data_section_is_verified_where_there_is_one(
-    path: Path, tmp_path: Path
-) -> None:
-    """Metadata have no checksum of their own: only this one finds a changed letter in them."""
-    copy = tmp_path / "copy.mcap"
-    with path.open("rb") as stream, copy.open("wb") as out:
-        reader = make_reader(stream)
-        writer = Writer(out, enable_data_crcs=True)
-        writer.start(library="octarm")
-        for record in reader.iter_metadata():
-            assert isinstance(record, Metadata)
-            writer.add_metadata(record.name, record.metadata)
-        writer.finish()
-    raw = copy.read_bytes()
+def test_a_changed_letter_in_metadata_is_noticed(path: Path, tmp_path: Path) -> None:
+    """They have no checksum of their own: the one over the data section finds it, and nobody knows where."""
+    raw = path.read_bytes()
     ((end, _),) = Anatomy.of(raw).of_kind(Opcode.DATA_END)
     assert int.from_bytes(raw[end + 9 : end + 13], "little") == zlib.crc32(raw[:end])
-    assert info(copy)["file"]["closed"] is True
+    copy, out = tmp_path / "copy.mcap", tmp_path / "out.mcap"
     copy.write_bytes(re.sub(rb'"seed":\d', b'"seed":7', raw, count=1))
     assert copy.read_bytes() != raw
     facts = info(copy)
-    assert facts["file"]["stops"] == "the checksum of its data section does not fit"
+    assert facts["file"]["stops"] == "has a data section whose checksum does not fit"
     assert facts["whole"] is False
+    recover(copy, out)
+    assert check_container(out).message_count == check_container(path).message_count
+    facts = info(out)
+    assert (facts["file"]["closed"], facts["whole"]) == (True, False)
+    assert "recovered from copy.mcap, which has a data section" in info_table(facts)
