@@ -39,7 +39,7 @@ def link_facts(
     """
     own = _own_clocks(facts.get("hosts"), run.nodes, notes)
     kinds = link_kinds(run.nodes, run.firsts, own)
-    y, c, d = (_instants(tables, run.nodes, field) for field in _INSTANTS)
+    y, c, d = (_instants(tables, run, field) for field in _INSTANTS)
     found = link_latencies(y, c, d)
     rows: list[dict[str, Any]] = []
     pooled: dict[str, Any] = {}
@@ -87,11 +87,12 @@ class _Place(msgspec.Struct):
     own_clock: bool
 
 
-def _instants(tables: Mapping[str, Table], nodes: int, field: str) -> Array:
+def _instants(tables: Mapping[str, Table], run: RunConfig, field: str) -> Array:
     """(K, n): one instant of every node at every tick that any of them has recorded; NaN where missing."""
-    timing = [tables.get(f"/node/{label(i, nodes)}/timing") for i in range(nodes)]
+    timing = [tables.get(f"/node/{label(i, run.nodes)}/timing") for i in range(run.nodes)]
     ticks = max((int(one.ticks.max()) + 1 for one in timing if one is not None), default=0)
-    out = np.full((ticks, nodes), np.nan)
+    ticks = min(max(ticks, 0), run.ticks)  # a message without a checksum may say anything
+    out = np.full((ticks, run.nodes), np.nan)
     for i, table in enumerate(timing):
         if table is None or field not in table.columns:
             continue

@@ -33,16 +33,21 @@ from mcap.records import (
 
 from analysis.mcap_records import FRAME, MAGIC, Announcement
 from analysis.mcap_records import Message as Walked
-from analysis.mcap_walk import Piece
+from analysis.mcap_walk import PRIVATE, Piece
 
 
 class McapCopy:
-    """The growing file. `add` takes pieces in order, `finish` writes the index and the end mark."""
+    """The growing file. `add` takes pieces in order, `finish` writes the index and the end mark.
 
-    def __init__(self, stream: BinaryIO) -> None:
+    `library` goes into the header if the file that is copied has none that can be read.
+    """
+
+    def __init__(self, stream: BinaryIO, library: str) -> None:
         self._stream = stream
         self._offset = 0
         self._checksum = 0
+        self._begun = False
+        self._library = library
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._chunks: list[ChunkIndex] = []
@@ -80,6 +85,7 @@ class McapCopy:
         Indexes are not copied: they are made for this file.
         """
         value = piece.value
+        self._begin(value if isinstance(value, Header) else None)
         if isinstance(value, Chunk) and not piece.partial:
             self._announce(piece.announced)
             self._chunk(
@@ -95,11 +101,18 @@ class McapCopy:
             self.add_metadata(value)
         elif isinstance(value, Attachment):
             self._add_attachment(value)
-        elif isinstance(value, Header) or piece.opcode >= 0x80:
+        elif piece.opcode >= PRIVATE:
             self._put(raw)
+
+    def _begin(self, header: Header | None) -> None:
+        """The header comes before everything else."""
+        if not self._begun:
+            self._begun = True
+            self._put(_bytes((header or Header(profile="", library=self._library)).write))
 
     def add_metadata(self, record: Metadata) -> None:
         """Write a metadata record."""
+        self._begin(None)
         offset = self._offset
         length = self._put(_bytes(record.write))
         self._metadata.append(MetadataIndex(offset=offset, length=length, name=record.name))

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import zstandard
-from mcap.data_stream import ReadDataStream
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
@@ -29,7 +29,7 @@ Message = tuple[int, int, int, int, int, memoryview]
 """Offset of its record in the unpacked chunk, channel number, sequence, log time, publish time, payload. A
 plain tuple: there are hundreds of thousands."""
 Announcement: TypeAlias = Schema | Channel
-DECODING = (McapError, UnicodeDecodeError, struct.error)
+DECODING = (McapError, UnicodeDecodeError, struct.error, OverflowError, MemoryError)
 """What the functions here raise for a record that cannot be read."""
 READ: dict[int, Callable[[ReadDataStream], Any]] = {
     Opcode.HEADER: Header.read,
@@ -81,10 +81,13 @@ def decoded(opcode: int, content: memoryview) -> Any:
         content[-4:], "little"
     ):
         raise McapError("an attachment whose checksum does not fit")
-    stream = ReadDataStream(BytesIO(content))
-    value = READ[opcode](stream)
-    if opcode == Opcode.METADATA and stream.count != len(content):
-        raise McapError("metadata whose lengths contradict each other")
+    value = READ[opcode](ReadDataStream(BytesIO(content)))
+    builder = RecordBuilder()
+    value.write(builder)
+    if (
+        builder.end()[FRAME.size :] != content
+    ):  # the package takes what is there of a field that is too long
+        raise McapError("a record whose lengths contradict each other")
     return value
 
 

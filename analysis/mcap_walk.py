@@ -37,7 +37,7 @@ from analysis.mcap_records import (
     unpacked,
 )
 
-_PRIVATE = 0x80
+PRIVATE = 0x80
 """Opcodes from here on are other programs' own records, which a reader passes over."""
 _SIZES = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
 """Records of one size: their opcodes decide where the reading ends."""
@@ -231,7 +231,7 @@ class Walk:
             return True
         try:
             msgspec.json.decode(message[5])
-        except (msgspec.DecodeError, UnicodeDecodeError):
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             return False
         return True
 
@@ -239,7 +239,7 @@ class Walk:
 
     def _misread(self, opcode: int, size: int) -> bool:
         """Whether no record of this kind can be here."""
-        if opcode >= _PRIVATE:
+        if opcode >= PRIVATE:
             return False
         return opcode not in _KNOWN or _SIZES.get(opcode, size) != size
 

@@ -15,7 +15,7 @@ from mcap.records import Metadata
 from analysis.mcap_copy import McapCopy
 from analysis.mcap_records import read_bytes
 from analysis.mcap_walk import DATA_DOUBT, Damage, Walk
-from analysis.survey import RECOVERED, Survey, configuration_of, survey_of, ticks_of
+from analysis.survey import LIBRARY, RECOVERED, Survey, configuration_of, survey_of, ticks_of
 from analysis.whole_file import check_free, whole
 from wire.channels import SUMMARY
 from wire.errors import UsageError
@@ -40,7 +40,7 @@ def recover(path: Path, out: Path | None = None, *, force: bool = False) -> dict
         raise UsageError(f"--out {out}: that is the recording itself; give another name")
     check_free(out, force=force)
     with whole(out, force=force) as growing, growing.open("wb") as stream:
-        copy = McapCopy(stream)
+        copy = McapCopy(stream, LIBRARY)
         _copy(memoryview(raw), copy, found)
     return _facts(found, out, copy)
 

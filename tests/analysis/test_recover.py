@@ -157,6 +157,25 @@ def test_a_flipped_bit_costs_its_own_chunk_or_what_follows_a_broken_frame(
     assert kept_less > 15
 
 
+def test_lengths_that_cannot_be_are_damage_and_no_error(
+    path: Path, rows: list[Row], tmp_path: Path
+) -> None:
+    """The largest number in place of every byte of the first lengths in each kind of record."""
+    raw = path.read_bytes()
+    anatomy = Anatomy.of(raw)
+    damaged = tmp_path / "damaged.mcap"
+    kinds = (Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT, Opcode.CHUNK, Opcode.MESSAGE_INDEX)
+    for kind in kinds:
+        at, _ = anatomy.of_kind(kind)[0]
+        for place in range(at + 1, at + 54):
+            bad = bytearray(raw)
+            bad[place] = 0xFF
+            damaged.write_bytes(bad)
+            found = outcome(damaged, thorough=False)
+            if found is not None:
+                assert set(found) <= set(rows)
+
+
 def test_a_damaged_chunk_in_the_middle_is_left_out_and_what_follows_is_kept(
     path: Path, rows: list[Row], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
