@@ -14,7 +14,7 @@ import tyro
 
 from supervise.entry import serve, show_json, teller
 from supervise.options import RunOptions
-from supervise.recording_verbs import animate, diff, export, plot, replay
+from supervise.recording_verbs import animate, diff, export, info, plot, recover, replay
 from supervise.shipped import DEFAULT_ARM, DEFAULT_GAINS
 from wire.errors import ExitCode, UsageError
 
@@ -423,11 +423,13 @@ VERBS: dict[str, Callable[..., int]] = {
     "design": design,
     "solve": solve,
     "deploy": deploy,
+    "info": info,
     "plot": plot,
     "animate": animate,
+    "replay": replay,
     "diff": diff,
     "export": export,
-    "replay": replay,
+    "recover": recover,
     "study": study,
     "bench": bench,
     "doctor": doctor,

@@ -6,7 +6,7 @@ artefact (attached), the counters, and one channel per kind of message and node 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -42,7 +42,8 @@ Array = npt.NDArray[np.float64]
 QUANTITIES = (*STATE, *COMMAND)
 """What a node computes each tick, in the order of the dense step's output."""
 _FLOW = ("messages", "bytes", "crc32")
-_ENDINGS = ("finished", "interrupted", "safety_stop")
+ENDINGS = ("finished", "interrupted", "safety_stop")
+"""Names of the events that say how a run ended."""
 
 
 @dataclass(frozen=True)
@@ -281,7 +282,7 @@ class Recording:
         table = self.tables.get(EVENTS.topic)
         if table is None or not table.rows:
             return None
-        names = [name for name in table.column("name") if name in _ENDINGS]
+        names = [name for name in table.column("name") if name in ENDINGS]
         return names[-1] if names else None
 
     @property
@@ -310,13 +311,8 @@ def read_recording(path: Path) -> Recording:
     content = read_mcap(path)
     facts = content.metadata.get(METADATA)
     if facts is None:
-        raise UsageError(f"recording {path}: {_not_ours(content)}")
-    version = facts.get("format_version", "")
-    if version not in map(str, READABLE):
-        raise UsageError(
-            f"recording {path}: expected format version {' or '.join(map(str, READABLE))}, got "
-            f"{version or 'none'}; read it with the octarm that wrote it, or a newer one"
-        )
+        raise UsageError(not_ours(path, content.unfinished, content.payloads))
+    check_version(path, facts)
     if "run" not in facts:
         raise UsageError(f"recording {path}: no run configuration in its metadata; it was edited")
     configuration = loads(RunConfig, facts["run"], f"recording {path}: run configuration")
@@ -338,13 +334,23 @@ def read_recording(path: Path) -> Recording:
     )
 
 
-def _not_ours(content: McapContent) -> str:
-    if content.unfinished is not None:
-        return f"it {content.unfinished}, before anything of octarm; the run did not begin"
-    topics = ", ".join(sorted(content.payloads)[:5]) or "none"
+def check_version(path: Path, facts: Mapping[str, str]) -> None:
+    """UsageError unless the metadata of octarm say a format version that is read."""
+    version = facts.get("format_version", "")
+    if version not in map(str, READABLE):
+        raise UsageError(
+            f"recording {path}: expected format version {' or '.join(map(str, READABLE))}, got "
+            f"{version or 'none'}; read it with the octarm that wrote it, or a newer one"
+        )
+
+
+def not_ours(path: Path, stops: str | None, topics: Iterable[str]) -> str:
+    """Why an MCAP file without the metadata of octarm is refused; `stops` says how it stops, if it does."""
+    if stops is not None:
+        return f"recording {path}: it {stops}, before anything of octarm; the run did not begin"
     return (
-        f"an MCAP file without {METADATA!r} metadata, so not of octarm (its topics: {topics}); "
-        "give the .mcap file that a run left behind"
+        f"recording {path}: an MCAP file without {METADATA!r} metadata, so not of octarm (its topics: "
+        f"{', '.join(sorted(topics)[:5]) or 'none'}); give the .mcap file that a run left behind"
     )
 
 

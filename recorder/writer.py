@@ -32,7 +32,12 @@ class RecordingWriter:
         self, path: Path, tick_s: float, layout: Mapping[int, Sequence[Channel]], flush_s: float
     ) -> None:
         self._file = path.open("xb")  # never over an existing recording
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer = Writer(
+            self._file,
+            chunk_size=CHUNK_BYTES,
+            compression=CompressionType.ZSTD,
+            enable_data_crcs=True,  # metadata and message indexes have no other checksum
+        )
         self._writer.start(profile="", library="octarm")
         self._tick_s = tick_s
         self._flush_s = flush_s

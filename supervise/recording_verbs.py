@@ -200,3 +200,49 @@ def replay(
     done = run_replay(options, teller(silent=quiet or json))
     show_json(done.facts) if json else print(done.text)
     return int(done.exit_code)
+
+
+def info(
+    recording: tyro.conf.Positional[Path],
+    *,
+    every: Annotated[Flag, tyro.conf.arg(name="all")] = False,
+    json: Flag = False,
+) -> int:
+    """Say what a recording is: the run, its messages and latencies, the file and whether it is whole.
+
+    Args:
+        recording: The recording, or the run's directory that holds it; also one that was cut short or damaged.
+        every: Show every topic, process, link and event, instead of those of all nodes together.
+        json: Print one JSON object instead of the tables.
+    """
+    from analysis.info import info as facts_of
+    from analysis.info_table import info_table
+    from analysis.recording import find_recording
+
+    facts = facts_of(find_recording(recording))
+    show_json(facts) if json else print(info_table(facts, every=every), end="")
+    return int(ExitCode.OK if facts["whole"] else ExitCode.DEGRADED)
+
+
+def recover(
+    recording: tyro.conf.Positional[Path],
+    *,
+    out: Path | None = None,
+    force: Flag = False,
+    json: Flag = False,
+) -> int:
+    """Make a closed, indexed recording of what is left of one that was cut short or damaged.
+
+    Args:
+        recording: The recording, or the run's directory that holds it; a whole one is left alone.
+        out: File to write, default NAME.recovered.mcap beside the recording.
+        force: Write over an existing file.
+        json: Print one JSON object instead of lines.
+    """
+    from analysis.recording import find_recording
+    from analysis.recover import recover as make_whole
+    from analysis.recover import recover_text
+
+    facts = make_whole(find_recording(recording), out, force=force)
+    show_json(facts) if json else print(recover_text(facts))
+    return int(ExitCode.OK)

@@ -1,0 +1,103 @@
+"""The latencies of a recorded run's links: tables of /node/NN/timing in, percentiles and the worst link out.
+
+Part of `analysis.info`; the arithmetic is `analysis.link_latency`'s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from analysis.link_latency import (
+    CLOCKS,
+    IN_MEMORY,
+    MESSAGES,
+    Array,
+    link_kinds,
+    link_latencies,
+    percentiles_ms,
+)
+from analysis.table import Table
+from wire.channels import label
+from wire.errors import UsageError
+from wire.run_config import RunConfig
+
+WORST_BY = "p99"
+_INSTANTS = tuple(f"{what}_received_wall_ns" for what in ("measurement", "forward", "backward"))
+
+
+def link_facts(
+    tables: Mapping[str, Table], run: RunConfig, facts: Mapping[str, str], notes: list[str]
+) -> dict[str, Any]:
+    """Percentiles in ms over all links and ticks, forward and backward; the worst link by its p99; every link.
+
+    `left_out` counts links without a latency by reason: in one process ("in memory"), or between clocks that
+    cannot be compared ("clocks"); `unrecorded` have no tick with both instants.
+    """
+    own = _own_clocks(facts.get("hosts"), run.nodes, notes)
+    kinds = link_kinds(run.nodes, run.firsts, own)
+    y, c, d = (_instants(tables, run, field) for field in _INSTANTS)
+    found = link_latencies(y, c, d)
+    rows: list[dict[str, Any]] = []
+    pooled: dict[str, Any] = {}
+    for way, latencies in (("forward", found.forward_ns), ("backward", found.backward_ns)):
+        chosen = [i for i, kind in enumerate(kinds) if kind == MESSAGES]
+        pooled[way] = percentiles_ms(latencies[:, chosen])
+        for i in chosen:
+            ends = (i, i + 1) if way == "forward" else (i + 1, i)
+            values = percentiles_ms(latencies[:, i])
+            rows.append({"way": way, "from": ends[0], "to": ends[1], "latency_ms": values})
+    measured = [row for row in rows if row["latency_ms"] is not None]
+    worst = max(measured, key=lambda row: float(row["latency_ms"][WORST_BY]), default=None)
+    return {
+        **{f"{way}_ms": pooled[way] for way in ("forward", "backward")},
+        "measured": len(measured),
+        "left_out": {why: kinds.count(why) * 2 for why in (IN_MEMORY, CLOCKS) if why in kinds},
+        "unrecorded": len(rows) - len(measured),
+        "worst": worst,
+        "links": rows,
+    }
+
+
+def _own_clocks(hosts: str | None, nodes: int, notes: list[str]) -> frozenset[int]:
+    """Nodes whose instants count from their own first measurement; hosts have consecutive nodes."""
+    if hosts is None:
+        return frozenset()
+    try:
+        places = msgspec.json.decode(hosts, type=list[_Place])
+    except msgspec.DecodeError as error:
+        notes.append(f"the hosts in the metadata cannot be read: {error}")
+        return frozenset(range(nodes))  # nothing is known of any clock
+    own: set[int] = set()
+    first = 0
+    for place in places:
+        if place.own_clock:
+            own.update(range(first, first + place.nodes))
+        first += place.nodes
+    return frozenset(own)
+
+
+class _Place(msgspec.Struct):
+    """A host as the metadata have it; its other facts are of no interest here."""
+
+    nodes: int
+    own_clock: bool
+
+
+def _instants(tables: Mapping[str, Table], run: RunConfig, field: str) -> Array:
+    """(K, n): one instant of every node at every tick that any of them has recorded; NaN where missing."""
+    timing = [tables.get(f"/node/{label(i, run.nodes)}/timing") for i in range(run.nodes)]
+    ticks = max((int(one.ticks.max()) + 1 for one in timing if one is not None), default=0)
+    ticks = min(max(ticks, 0), run.ticks)  # a message without a checksum may say anything
+    out = np.full((ticks, run.nodes), np.nan)
+    for i, table in enumerate(timing):
+        if table is None or field not in table.columns:
+            continue
+        try:
+            out[:, i] = table.by_tick((field,), ticks)[:, 0]
+        except UsageError:
+            continue
+    return out
