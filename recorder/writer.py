@@ -20,7 +20,9 @@ from recorder.merge import Row
 from wire.channels import METADATA, SUMMARY, Channel
 from wire.foxglove import EVENTS, SCENE, log_message
 
-CHUNK_BYTES = 64 * 1024
+CHUNK_BYTES = 256 * 1024
+"""Before packing. Smaller ones lose less to a kill, which flushing in time bounds already, and spend more on their
+indexes: a fifth of the file with 64 KiB."""
 _encode = msgspec.json.Encoder().encode
 
 
