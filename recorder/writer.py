@@ -21,8 +21,8 @@ from wire.channels import METADATA, SUMMARY, Channel
 from wire.foxglove import EVENTS, SCENE, log_message
 
 CHUNK_BYTES = 256 * 1024
-"""Before packing. Smaller ones lose less to a kill, which flushing in time bounds already, and spend more on their
-indexes: a fifth of the file with 64 KiB."""
+"""Before packing. Smaller ones spend more on their indexes, a fifth of the file with 64 KiB; what a kill loses
+is bounded by flushing in time."""
 _encode = msgspec.json.Encoder().encode
 
 
