@@ -177,6 +177,16 @@ def port_taken(port: int, address: str = LOOPBACK) -> str | None:
     return None
 
 
+def live_port(port: int | None) -> int:
+    """The port for the live page, 0 for any that is free; UsageError if the one that is asked for is taken."""
+    if port and (reason := port_taken(port)):
+        raise UsageError(
+            f"--live-port {port}: port {port} of {LOOPBACK} cannot be used ({reason}); give another or "
+            "leave it out"
+        )
+    return port or 0
+
+
 def _free_base(count: int, address: str = LOOPBACK) -> int | None:
     """The first of so many free ports in a row, None if none were found."""
     for _ in range(100):

@@ -29,9 +29,12 @@ from supervise.spacing import spacing_name
 from wire.artefact import GainsArtefact, digest, read_artefact
 from wire.channels import FORMAT_VERSION, NODES_ATTACHMENT
 from wire.errors import UsageError
+from wire.joints import TipConfig
 from wire.placement import FIFO_PRIORITY
 from wire.run_config import (
+    GoalConfig,
     LinkConfig,
+    LiveConfig,
     NodeConfig,
     PaceConfig,
     PlantConfig,
@@ -44,6 +47,7 @@ from wire.run_config import (
 
 BATCH_TICKS = 32
 FLUSH_S = 0.5
+GOAL_POINTS = 65
 CORES = 2
 """Two sweeps run towards each other; more cores would only add wake-ups across cores (runtime
 figures)."""
@@ -57,6 +61,8 @@ class Plan:
     nodes: tuple[NodeConfig, ...]
     plant: PlantConfig
     recorder: RecorderConfig
+    live: LiveConfig | None
+    """Of the process that shows the run; None: nobody wants to see it."""
     endpoints: Endpoints
     directory: Path
     """Where the recording and everything else about the run goes."""
@@ -233,6 +239,18 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             },
             links=links([], [endpoints.plant]),
         ),
+        live=None
+        if not options.live
+        else LiveConfig(
+            run=run,
+            port=options.live_port or 0,
+            forward_widths=tuple(f.forward_received for f in deployment.nodes),
+            backward_widths=tuple(f.backward_received for f in deployment.nodes),
+            tip=TipConfig(references.nodes[-1].to_plain(), deployment.nodes[-1].bend_m),
+            goals=_goals(prepared),
+            elsewhere=tuple(sorted(elsewhere)),
+            links=links([], [endpoints.plant]),
+        ),
         endpoints=endpoints,
         directory=directory,
         hosts=hosts,
@@ -248,6 +266,28 @@ def _pace(options: RunOptions) -> PaceConfig | None:
         return None
     period_s = options.tick_s if options.period_s is None else options.period_s
     return PaceConfig(period_s, options.hold_ticks)
+
+
+def _goals(prepared: Prepared) -> tuple[GoalConfig, ...]:
+    """The setpoints that the run visits, as shapes."""
+    from analysis.goals import setpoint_shape
+
+    artefact = prepared.artefact
+    visited = sorted({artefact.setpoint_index(name) for name in prepared.course.visited})
+    return tuple(
+        GoalConfig(
+            index,
+            tuple(
+                map(
+                    tuple,
+                    setpoint_shape(
+                        artefact.setpoints[index], artefact.arm.length_m, GOAL_POINTS
+                    ).tolist(),
+                )
+            ),
+        )
+        for index in visited
+    )
 
 
 def _cores(nodes: int) -> list[int | None]:
