@@ -146,7 +146,7 @@ class LiveProcess:
                 self._tell(state="running")
             elif message.get("do") == "ending":
                 self._tell(state="ending", message=message["message"])
-            elif message.get("do") == "finish":
+            elif message.get("do") == "finish" and not self._ended:
                 if self._news.watched and self._samples is not None:
                     self._take_all()
                     self._show()
@@ -186,6 +186,7 @@ class LiveProcess:
         if self._samples is not None:
             self._samples.undeclare()
             self._samples = None
+            self._news.forget("frame")
 
     def _take_all(self) -> None:
         began = monotonic()

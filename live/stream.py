@@ -43,6 +43,11 @@ class Broadcast:
             self._latest[kind] = self._number, text
             self._news.notify_all()
 
+    def forget(self, kind: str) -> None:
+        """The last event of this kind is too old for a page that comes."""
+        with self._news:
+            self._latest.pop(kind, None)
+
     def end(self) -> None:
         """Nothing more will come: whoever waits gets what is there, then None."""
         with self._news:
