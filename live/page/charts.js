@@ -202,7 +202,7 @@ export class LinkChart {
 
   say(links) {
     const parts = [];
-    const tell = (from, to, us, most) => `${from} \u2192 ${to} ${us === null ? "not measured" : `${us} \u00b5s (longest ${most})`}`;
+    const tell = (from, to, us, most) => `${from} \u2192 ${to}: ${us === null ? "not measured" : `${us} \u00b5s (longest ${most})`}`;
     const i = this.shown;
     if (i !== null) {
       parts.push(tell(i, i + 1, links.forward_us[i], links.forward_most_us[i]));
