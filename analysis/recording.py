@@ -24,7 +24,6 @@ from wire.artefact import FORMAT as GAINS_FORMAT
 from wire.artefact import GainsArtefact, parse_artefact
 from wire.channels import (
     COMMAND,
-    EVENTS,
     MEASUREMENT,
     METADATA,
     PACE,
@@ -36,6 +35,7 @@ from wire.channels import (
     label,
 )
 from wire.errors import UsageError
+from wire.foxglove import EVENTS
 from wire.run_config import RunConfig, loads
 
 Array = npt.NDArray[np.float64]

@@ -9,16 +9,17 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from platform import python_version
 from typing import Any
 
 from bench.campaign import Campaign
 from bench.group import Signals
-from bench.machine import machine_facts
 from bench.options import BenchOptions
 from bench.picture import draw
 from bench.results import FORMAT, read_results, write_results
 from bench.statistics import ratios, targets
 from bench.table import table
+from supervise.origin import machine_facts, versions
 from wire.errors import ExitCode, OctarmError, UsageError
 
 RESULTS = "bench.json"
@@ -82,7 +83,7 @@ def _facts(
         "date": date,
         "seed": options.seed,
         "options": options.facts(),
-        "machine": machine_facts(),
+        "machine": {**machine_facts(), "python": python_version(), "versions": versions()},
         "ended": "finished" if ended is None else _ending(ended)[1],
         "notes": campaign.notes,
         "rows": campaign.rows,

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from live.latency import SENT, Instants, link_latencies, measurable
-from live.rows import NEVER, Array, Ints, RecentRows, columns_of
-from wire.channels import SHAPE_POINTS, STATE, SWEEP_TIMING
+from live.rows import NEVER, Array, Ints, RecentRows
+from wire.channels import BATCH_NS, SHAPE_POINTS, STATE, columns_of, label
 from wire.joints import Joints
 from wire.messages import PLANT, Batch
 from wire.run_config import LiveConfig
@@ -26,8 +26,8 @@ WINDOW_S = 5.0
 """Running figures are those of the last so many seconds."""
 STUCK_S = 1.0
 """After so long without a tick of everybody the plant's newest is shown, with what the nodes last said."""
-SLACK_S = 0.75
-"""A node is on time whose rows are no older than this and two periods: a batch waits a quarter of a second."""
+SLACK_S = 4e-9 * BATCH_NS
+"""A node is on time whose rows are no older than this and two periods: a batch waits a quarter of that."""
 CURVATURE = STATE.index("curvature_per_m")
 METRES, CURVATURES, NUMBERS = 5, 4, 6
 """Decimals of positions, decimals of curvatures, significant digits of errors."""
@@ -48,16 +48,17 @@ class FrameMaker:
         self._weights = np.asarray(run.energy_weights)
         self._firsts: dict[int, Array] = {}
         self._first_energy = 0.0
-        plant, node = self.rows.layout[PLANT], self.rows.layout[0]
+        plant, root = self.rows.layout[PLANT], self.rows.layout[0]
         self._tip, self._shape = columns_of(plant, "/plant/tip"), columns_of(plant, "/plant/shape")
         self._late = columns_of(plant, "/plant/pace").start
-        timing = columns_of(plant, "/sweep/timing").start
         self._due, self._began, self._took = (
-            timing + SWEEP_TIMING.index(name)
-            for name in ("due_wall_ns", "started_wall_ns", "duration_wall_ns")
+            columns_of(plant, "/sweep/timing", f"{name}_wall_ns").start
+            for name in ("due", "started", "duration")
         )
-        self._estimate = columns_of(node, "/estimate")
-        self._setpoint = columns_of(node, "/schedule").start
+        # before the sums every node's row is the same
+        node = f"/node/{label(0, run.nodes)}"
+        self._estimate = columns_of(root, f"{node}/estimate")
+        self._setpoint = columns_of(root, f"{node}/schedule", "setpoint").start
         self._sweeps: deque[tuple[Array, Array, int]] = deque()
         """Instants begun in ns, durations in ns, first tick: of the batches of the last seconds."""
         self._since = self._counted = NEVER

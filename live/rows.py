@@ -24,16 +24,6 @@ KEPT = 128
 NEVER = -1
 
 
-def columns_of(channels: Sequence[Channel], topic: str) -> slice:
-    """Where the fields of a channel stand in a row; `topic` may be the end of the channel's."""
-    at = 0
-    for channel in channels:
-        if channel.topic.endswith(topic):
-            return slice(at, at + len(channel.fields))
-        at += len(channel.fields)
-    raise KeyError(topic)
-
-
 class RecentRows:
     """Rows of plant and nodes by tick.
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from node.row import Batch, Y
 from node.sweep import Array, NodeSweep, Payload, bytes_of
+from wire.channels import BATCH_NS
 from wire.errors import UsageError
 from wire.messages import F8, Reason, RejectedError
 
@@ -58,10 +59,6 @@ class Outlet(Protocol):
 
     def begins(self, tick: int, setpoint: int) -> None:
         """The tick whose messages are expected now, and its setpoint."""
-
-
-BATCH_NS = 250_000_000
-"""Rows do not wait longer than this for a batch to fill, while ticks go on."""
 
 
 class SegmentBlock:

@@ -12,14 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from plant.model import ArmPlant
-from wire.channels import PACE, SHAPE_POINTS, SWEEP_TIMING, plant_channels, width
+from wire.channels import BATCH_NS, PACE, SHAPE_POINTS, SWEEP_TIMING, plant_channels, width
 from wire.counters import Flow
 from wire.messages import PLANT, encode_batch
 from wire.reference import Reference
 
 Array = npt.NDArray[np.float64]
-BATCH_NS = 250_000_000
-"""Rows do not wait longer than this for a batch to fill, while ticks go on."""
 
 
 class PlantRecord:

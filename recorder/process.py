@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from recorder.merge import Gap, Row, TickMerge
+from recorder.scene import SceneDrawer
 from recorder.writer import RecordingWriter
 from wire import session as zsession
 from wire.channels import (
@@ -26,6 +27,7 @@ from wire.channels import (
     STATE,
     SWEEP_TIMING,
     Channel,
+    columns_of,
     label,
     node_channels,
     plant_channels,
@@ -75,6 +77,8 @@ class RecorderProcess:
         self._columns = {sender: width(channels) for sender, channels in layout.items()}
         self._merge = TickMerge(list(layout))
         self._writer = RecordingWriter(Path(config.path), run.tick_s, layout, config.flush_s)
+        self._scenes = SceneDrawer(config)
+        self._tip_error = columns_of(layout[PLANT], "/plant/tip", "error_m")
         self._counters: dict[int, dict[str, int]] = {}
         self._received = Flow()
         self._rejections = Rejections()
@@ -170,6 +174,8 @@ class RecorderProcess:
             self._tell_setpoint(tick, rows)
             self._tell_late(tick, rows)
             self._writer.tick(tick, rows)
+            if scene := self._scenes.draw(tick, self._writer.log_time_ns(tick), rows):
+                self._writer.scene(tick, scene)
             self._last = (tick, rows)
             if tick == 0:
                 self._first_energy = self._error_energy(rows)
@@ -211,7 +217,7 @@ class RecorderProcess:
         energy = self._error_energy(rows)
         if energy is None:
             return
-        tip_error_m = rows[PLANT][4 * self._config.run.nodes + 2]
+        (tip_error_m,) = rows[PLANT][self._tip_error]
         relative = math.sqrt(energy / self._first_energy) if self._first_energy else None
         self._child.status(
             "progress", tick=tick + 1, tip_error_m=tip_error_m, estimation_error=relative

@@ -11,19 +11,21 @@ from collections.abc import Mapping, Sequence
 from os import sched_yield
 from pathlib import Path
 from time import monotonic
+from typing import Any
 
 import msgspec
 from mcap.writer import CompressionType, Writer
 
 from recorder.merge import Row
-from wire.channels import EVENTS, METADATA, SUMMARY, Channel
+from wire.channels import METADATA, SUMMARY, Channel
+from wire.foxglove import EVENTS, SCENE, log_message
 
 CHUNK_BYTES = 64 * 1024
 _encode = msgspec.json.Encoder().encode
 
 
 class RecordingWriter:
-    """Writes ticks, events, metadata and attachments; `layout` gives the channels of each sender's
+    """Writes ticks, events, scenes, metadata and attachments; `layout` gives the channels of each sender's
     rows."""
 
     def __init__(
@@ -39,6 +41,7 @@ class RecordingWriter:
         self._slices: dict[int, list[tuple[int, tuple[str, ...], int, int]]] = {}
         self._events = self._register(EVENTS)
         self._event_number = 0
+        self._scenes = self._register(SCENE)
         for sender, channels in layout.items():
             at, slices = 0, []
             for channel in channels:
@@ -68,7 +71,7 @@ class RecordingWriter:
         """Write one tick: the senders in the order of the layout, each row cut into its
         channels."""
         time_s = tick * self._tick_s
-        log_time = self._log_time(tick)
+        log_time = self.log_time_ns(tick)
         add = self._writer.add_message
         for sender, slices in self._slices.items():
             row = rows.get(sender)
@@ -83,14 +86,22 @@ class RecordingWriter:
     def event(self, tick: int, level: str, name: str, message: str) -> None:
         """Write one line of the run's story."""
         time_s = tick * self._tick_s
-        record = {"tick": tick, "time_s": time_s, "level": level, "name": name, "message": message}
-        log_time = self._log_time(tick)
+        log_time = self.log_time_ns(tick)
+        text = log_message(log_time, level, name, message)
+        record = {"tick": tick, "time_s": time_s, **text}
         self._event_number += 1
         self._writer.add_message(
             self._events, log_time, _encode(record), log_time, self._event_number
         )
 
-    def _log_time(self, tick: int) -> int:
+    def scene(self, tick: int, content: Mapping[str, Any]) -> None:
+        """Write a picture of the arm, see wire.foxglove.scene_update."""
+        log_time = self.log_time_ns(tick)
+        record = {"tick": tick, "time_s": tick * self._tick_s, **content}
+        self._writer.add_message(self._scenes, log_time, _encode(record), log_time, tick)
+
+    def log_time_ns(self, tick: int) -> int:
+        """Time of the arm at the tick's start, which everything of the tick is logged under."""
         return round(tick * self._tick_s * 1e9)
 
     def flush_if_due(self) -> None:

@@ -6,16 +6,14 @@ Nothing is started here, so every wrong value is refused before a process or a f
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import platform
 import secrets
 import time
 from dataclasses import dataclass
-from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -24,10 +22,11 @@ from deploy.path import References, make_references
 from supervise.endpoints import Endpoints
 from supervise.hosts import Host, this_machine
 from supervise.options import RunOptions
+from supervise.origin import git_revision, machine_facts, versions
 from supervise.scenario import Course, settle
 from supervise.spacing import spacing_name
 from wire.artefact import GainsArtefact, digest, read_artefact
-from wire.channels import FORMAT_VERSION, NODES_ATTACHMENT
+from wire.channels import FLUSH_S, FORMAT_VERSION, NODES_ATTACHMENT
 from wire.errors import UsageError
 from wire.joints import TipConfig
 from wire.placement import FIFO_PRIORITY
@@ -46,8 +45,8 @@ from wire.run_config import (
 )
 
 BATCH_TICKS = 32
-FLUSH_S = 0.5
 GOAL_POINTS = 65
+"""Of a setpoint's shape on the live page."""
 CORES = 2
 """Two sweeps run towards each other; more cores would only add wake-ups across cores (runtime
 figures)."""
@@ -210,6 +209,9 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         )
 
     configs = tuple(node(i) for i in run.firsts)
+    forward_widths = tuple(f.forward_received for f in deployment.nodes)
+    backward_widths = tuple(f.backward_received for f in deployment.nodes)
+    tip = TipConfig(references.nodes[-1].to_plain(), deployment.nodes[-1].bend_m)
     return Plan(
         run=run,
         nodes=configs,
@@ -228,10 +230,11 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         recorder=RecorderConfig(
             run=run,
             path=str(directory / "recording.mcap"),
-            forward_widths=tuple(f.forward_received for f in deployment.nodes),
-            backward_widths=tuple(f.backward_received for f in deployment.nodes),
+            forward_widths=forward_widths,
+            backward_widths=backward_widths,
+            tip=tip,
             flush_s=FLUSH_S,
-            metadata=_metadata(run, epoch_ns, () if placed is None else hosts),
+            metadata=_metadata(prepared, run, epoch_ns, () if placed is None else hosts),
             attachments={
                 "gains.json": options.gains.read_text(),
                 "run.json": dumps(run),
@@ -244,9 +247,9 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         else LiveConfig(
             run=run,
             port=options.live_port or 0,
-            forward_widths=tuple(f.forward_received for f in deployment.nodes),
-            backward_widths=tuple(f.backward_received for f in deployment.nodes),
-            tip=TipConfig(references.nodes[-1].to_plain(), deployment.nodes[-1].bend_m),
+            forward_widths=forward_widths,
+            backward_widths=backward_widths,
+            tip=tip,
             goals=_goals(prepared),
             elsewhere=tuple(sorted(elsewhere)),
             links=links([], [endpoints.plant]),
@@ -299,30 +302,39 @@ def _cores(nodes: int) -> list[int | None]:
     return [pair[i * len(pair) // nodes] for i in range(nodes)]
 
 
-def _metadata(run: RunConfig, epoch_ns: int, hosts: tuple[Host, ...]) -> dict[str, str]:
+def _metadata(
+    prepared: Prepared, run: RunConfig, epoch_ns: int, hosts: tuple[Host, ...]
+) -> dict[str, str]:
     """The record "octarm": what the recording must say about where it came from."""
-    packages = ("octarm", "numpy", "eclipse-zenoh", "msgpack", "mcap", "msgspec")
-    versions = {name: _version(name) for name in packages}
-    versions["python"] = platform.python_version()
-    places = [
-        {"name": h.name, "address": h.address, "nodes": h.nodes, "own_clock": h.own_clock}
-        for h in hosts
-    ]
+    artefact = prepared.artefact
+    certificates = {
+        setpoint.name: {
+            "observer": setpoint.observer_certificate,
+            "controller": setpoint.controller_certificate,
+        }
+        for setpoint in artefact.setpoints
+    }
+    facts: dict[str, Any] = {
+        "certificate": certificates,
+        "arm": artefact.arm,
+        "scenario": prepared.course.told,
+        "versions": versions(),
+        "machine": machine_facts(),
+    }
+    if hosts:
+        facts["hosts"] = [
+            {"name": h.name, "address": h.address, "nodes": h.nodes, "own_clock": h.own_clock}
+            for h in hosts
+        ]
+    revision = git_revision()
     return {
         "format_version": str(FORMAT_VERSION),
         "run_id": run.run_id,
         "artefact_sha256": run.artefact_sha256,
         "seed": str(run.seed),
         "run": dumps(run),
-        "versions": json.dumps(versions),
         "epoch_ns": str(epoch_ns),
         "started_at": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
-        "machine": platform.machine(),
-    } | ({"hosts": json.dumps(places)} if hosts else {})
-
-
-def _version(name: str) -> str:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return "unknown"
+        **{name: msgspec.json.encode(fact).decode() for name, fact in facts.items()},
+        **({} if revision is None else {"git_revision": revision}),
+    }

@@ -151,6 +151,8 @@ def _seconds(key: str, value: float, *, positive: bool) -> None:
 class Course:
     """A scenario with the user's options on top: everything about a run's story, nothing open."""
 
+    told: Scenario
+    """As the file tells it, without the options."""
     scenario: str
     setpoint: str
     initial: str
@@ -192,6 +194,7 @@ def settle(options: RunOptions) -> Course:
     if cells is None and scenario.plant_cells is not None:
         cells = max(scenario.plant_cells, plant_cells(options.nodes, None))
     return Course(
+        told=scenario,
         scenario=scenario.name,
         setpoint=_given(options.setpoint, scenario.start),
         initial=_given(options.initial, scenario.initial),

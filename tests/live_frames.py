@@ -17,6 +17,8 @@ from wire.messages import PLANT
 from wire.run_config import GoalConfig, LinkConfig, LiveConfig
 
 Array = npt.NDArray[np.float64]
+METRES, CURVATURES = 0.51e-5, 0.51e-4
+"""What a frame may have lost by rounding."""
 
 
 def live_config(recording: Recording, elsewhere: tuple[int, ...] = (), port: int = 0) -> LiveConfig:
@@ -67,7 +69,7 @@ def latency(recording: Recording, sender: int, receiver: int) -> Array:
 
 
 def tip_end(recording: Recording, tick: int) -> tuple[float, float]:
-    """The estimated arm's tip: the last segment's chord in the reference, turned and stretched, after the sum."""
+    """The estimated arm's tip: the last chord of the reference, turned and stretched, put to the sum's end."""
     n = recording.nodes
     topic = f"/node/{label(n - 1, n)}/forward_sum"
     turn, x, y = recording.table(topic).by_tick(("turn_rad", "x_m", "y_m"), recording.ticks)[tick]
@@ -85,16 +87,18 @@ def check_frame(frame: dict[str, Any], recording: Recording) -> None:
     assert frame["estimate_tick"] == k
     assert not frame["late"]
     assert frame["time_s"] == pytest.approx(k * recording.tick_s, rel=1e-5)
-    metres = {"abs": 0.51e-5, "rel": 0.0}
-    assert frame["tip"] == pytest.approx(recording.tips_m[k].tolist(), **metres)
-    assert frame["shape"] == pytest.approx(recording.shapes_m[k].ravel().tolist(), **metres)
+    assert frame["tip"] == pytest.approx(recording.tips_m[k].tolist(), abs=METRES, rel=0.0)
+    assert frame["shape"] == pytest.approx(
+        recording.shapes_m[k].ravel().tolist(), abs=METRES, rel=0.0
+    )
     wanted = recording.of_plant("tip", ("reference_x_m", "reference_y_m"))[k]
-    assert frame["reference"] == pytest.approx(wanted.tolist(), **metres)
+    assert frame["reference"] == pytest.approx(wanted.tolist(), abs=METRES, rel=0.0)
     assert frame["tip_error_m"] == pytest.approx(recording.tip_error_m[k], rel=1e-5)
-    curvature = {"abs": 0.51e-4, "rel": 0.0}
-    assert frame["curvature"] == pytest.approx(recording.truth[k, :, 3].tolist(), **curvature)
+    assert frame["curvature"] == pytest.approx(
+        recording.truth[k, :, 3].tolist(), abs=CURVATURES, rel=0.0
+    )
     assert frame["curvature_estimate"] == pytest.approx(
-        recording.estimates[k, :, 3].tolist(), **curvature
+        recording.estimates[k, :, 3].tolist(), abs=CURVATURES, rel=0.0
     )
     assert frame["setpoint"] == recording.setpoints_used[k]
     joints = np.asarray(frame["joints"]).reshape(n + 1, 2)
@@ -102,8 +106,8 @@ def check_frame(frame: dict[str, Any], recording: Recording) -> None:
     for i in range(1, n):
         topic = f"/node/{label(i, n)}/forward_sum"
         end = recording.table(topic).by_tick(("x_m", "y_m"), recording.ticks)[k]
-        assert joints[i].tolist() == pytest.approx(end.tolist(), **metres)
-    assert joints[n].tolist() == pytest.approx(tip_end(recording, k), **metres)
+        assert joints[i].tolist() == pytest.approx(end.tolist(), abs=METRES, rel=0.0)
+    assert joints[n].tolist() == pytest.approx(tip_end(recording, k), abs=METRES, rel=0.0)
     faces = np.asarray(recording.configuration.faces_m)
     places = np.linspace(0.0, faces[-1], recording.shapes_m.shape[1])
     true = CubicSpline(places, recording.shapes_m[k])(faces[1:])

@@ -20,6 +20,14 @@ READABLE = (3, 4)
 NODES_ATTACHMENT = "nodes.json"
 """Attached since version 4: a JSON list of the configurations (wire.run_config.NodeConfig) that the node
 processes got, with matrices and references bit for bit."""
+LOSS_S = 0.5
+"""A run that is killed loses no more of its recording than this, or the tick that it was in.
+
+Rows wait `BATCH_NS` at most with their sender and `FLUSH_S` in the recorder; the rest is for the way."""
+BATCH_NS = 150_000_000
+"""Rows do not wait longer than this for a batch to fill, while ticks go on."""
+FLUSH_S = 0.2
+"""The recorder hands over to the operating system what it has every so often."""
 SHAPE_POINTS = 33
 """Points along the arm in /plant/shape, equally spaced in arclength, root and tip included."""
 METADATA = "octarm"
@@ -45,15 +53,34 @@ SWEEP_TIMING = ("due_wall_ns", "started_wall_ns", "duration_wall_ns", "advance_w
 """When the tick should begin (in lock-step: when it did); its first measurement sent; from there to the last
 command received by the plant (0: not within this tick; a late tick has it of the sweep that ended in it); and
 the arm's own integration."""
-EVENT = ("level", "name", "message")
+EVENT = ("timestamp", "level", "name", "message", "file", "line")
+"""Fields of foxglove.Log."""
 
-_TEXT = {"level", "name", "message"}
 _DESCRIPTION = {
     "force_n_per_m": "transverse load per length that the plant applies from this tick to the next",
     "error_m": "distance of the tip from the reference's",
     "bump_n_per_m": "part of the command that hides a change of gains and is faded out",
     "strain": "axial strain, dimensionless",
 }
+
+
+_UNITS = {
+    "_m_per_s": "m/s",
+    "_per_m": "1/m",
+    "_n_per_m": "N/m",
+    "_m": "m",
+    "_rad": "rad",
+    "_j": "J",
+    "_s": "s",
+    "_ns": "ns",
+}
+
+
+def unit_of(field: str) -> str:
+    """The unit that the end of a field's name says; "1" if it has none. Running sums are in scaled units,
+    root of an energy: "1" too."""
+    endings = [ending for ending in _UNITS if field.endswith(ending)]
+    return _UNITS[max(endings, key=len)] if endings else "1"
 
 
 @dataclass(frozen=True)
@@ -77,8 +104,7 @@ class Channel:
             "time_s": {"type": "number"},
         }
         for field in self.fields:
-            kind = "string" if field in _TEXT else "number"
-            properties[field] = {"type": kind}
+            properties[field] = {"type": "number", "unit": unit_of(field)}
             if field in _DESCRIPTION:
                 properties[field]["description"] = _DESCRIPTION[field]
         schema = {
@@ -142,9 +168,23 @@ def plant_channels(nodes: int) -> list[Channel]:
     ]
 
 
-EVENTS = Channel("/event", EVENT)
-
-
 def width(channels: Sequence[Channel]) -> int:
     """Numbers in a telemetry row with these channels."""
     return sum(len(channel.fields) for channel in channels)
+
+
+def columns_of(channels: Sequence[Channel], topic: str, *fields: str) -> slice:
+    """Where a telemetry row with these channels has the fields of a topic, all of them if none are named.
+
+    The fields must stand side by side. KeyError if there is no such topic, ValueError for such fields.
+    """
+    at = 0
+    for channel in channels:
+        if channel.topic == topic:
+            wanted = fields or channel.fields
+            first = channel.fields.index(wanted[0])
+            if channel.fields[first : first + len(wanted)] != wanted:
+                raise ValueError(f"{topic}: {wanted} do not stand side by side in {channel.fields}")
+            return slice(at + first, at + first + len(wanted))
+        at += len(channel.fields)
+    raise KeyError(topic)

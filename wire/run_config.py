@@ -278,8 +278,9 @@ class RecorderConfig:
     """Numbers in the forward sum that each node receives (0 at the root)."""
     backward_widths: tuple[int, ...]
     """Numbers in the backward sum that each node receives (0 at the tip)."""
+    tip: TipConfig
     flush_s: float
-    """A killed run loses at most this much wall-clock time of its recording."""
+    """See wire.channels.FLUSH_S."""
     metadata: dict[str, str]
     attachments: dict[str, str]
     """Name and text of each attached file."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from random import Random
 from types import SimpleNamespace
 from typing import Any
@@ -118,7 +117,9 @@ def test_figures_of_the_last_seconds_forget_what_is_older(
         maker.add(Batch(batch.tick, PLANT, slow))
     rates = maker._rates()
     assert rates["sweep_p99_ms"] == pytest.approx(1 + at)
-    assert rates["sweeps"] == sum(len(b.rows) for b in list(batches(rows[PLANT], PLANT, BATCH))[-6:])
+    assert rates["sweeps"] == sum(
+        len(b.rows) for b in list(batches(rows[PLANT], PLANT, BATCH))[-6:]
+    )
     assert rates["sweep_p50_ms"] >= at - 3
 
 
@@ -246,7 +247,9 @@ def test_after_a_pause_nothing_old_is_shown(
     maker.resume()
     assert maker.frame(None, running=True) is None
     frames: list[dict[str, Any]] = []
-    for batch in all_batches({s: {k: r for k, r in of.items() if k >= 60} for s, of in rows.items()}):
+    for batch in all_batches(
+        {s: {k: r for k, r in of.items() if k >= 60} for s, of in rows.items()}
+    ):
         maker.add(batch)
         if (frame := maker.frame(None, running=True)) is not None:
             frames.append(frame)

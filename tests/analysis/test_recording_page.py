@@ -7,10 +7,11 @@ import pytest
 from simulated_run import Scenario, write_recording
 
 from analysis.recording import read_recording
-from wire.channels import EVENTS, FORMAT_VERSION, Channel, node_channels, plant_channels
+from wire.channels import FORMAT_VERSION, Channel, node_channels, plant_channels
+from wire.foxglove import EVENTS, SCENE
 
 PAGE = (Path(__file__).parents[2] / "docs" / "recording.md").read_text()
-CHANNELS = [*node_channels(1, 3, 5, 3), *plant_channels(3), EVENTS]
+CHANNELS = [*node_channels(1, 3, 5, 3), *plant_channels(3), EVENTS, SCENE]
 
 
 @pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.topic)

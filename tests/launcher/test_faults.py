@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from typing import TYPE_CHECKING
 
 import pytest
 
 from analysis.recording import Recording, read_recording
+from wire.channels import LOSS_S
 
 if TYPE_CHECKING:
     from conftest import Cli, Start
@@ -73,6 +75,27 @@ def test_killed_recorder_leaves_a_readable_file(start: Start) -> None:
     assert cli.finish() == 3
     assert "the recorder was ended by SIGKILL" in cli.err
     assert nothing_left(cli).unfinished is not None
+
+
+def test_a_run_that_is_killed_loses_no_more_than_is_stated(start: Start) -> None:
+    """Everybody at once, in real time: the last recorded tick was due at most half a second before."""
+    cli = start.run(
+        "--nodes", "3", "--tick", "0.02", "--realtime", "--ticks", "100000", "--no-plot"
+    )
+    cli.wait_for_records()
+    time.sleep(1.0)
+    numbers = cli.processes().values()
+    killed_ns = time.monotonic_ns()
+    for number in numbers:
+        os.kill(number, signal.SIGKILL)
+    cli.finish()
+    assert cli.gone() == {}
+    recording = read_recording(cli.recording())
+    assert recording.unfinished is not None
+    due = recording.table("/sweep/timing").numbers("due_wall_ns")[recording.ticks - 1]
+    lost_s = (killed_ns - int(recording.facts["epoch_ns"]) - due) * 1e-9
+    assert recording.ticks > 20
+    assert 0.0 < lost_s <= LOSS_S + recording.tick_s
 
 
 def test_killed_launcher_leaves_nothing_alive(start: Start) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import pytest
@@ -94,7 +94,7 @@ def test_the_recording_is_an_ordinary_mcap_file(start: Start) -> None:
             assert schema is not None
             assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
             fields = json.loads(schema.data)["properties"]
-            record = msgspec.json.decode(message.data, type=dict[str, float | str])
+            record = msgspec.json.decode(message.data, type=dict[str, Any])
             assert record.keys() == fields.keys()
             assert message.log_time == round(float(record["time_s"]) * 1e9)
             times.append(message.log_time)

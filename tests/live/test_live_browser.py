@@ -146,7 +146,9 @@ def test_a_lost_connection_is_said_and_greys_the_page(start: Start, browser: Any
     expect(page.locator("body")).to_have_class("lost")
     expect(page.locator("#state")).to_have_text("connection lost")
     expect(page.locator("#banner")).to_contain_text("without a word about the run's end")
-    assert page.evaluate("getComputedStyle(document.querySelector('main')).filter") == "grayscale(1)"
+    assert (
+        page.evaluate("getComputedStyle(document.querySelector('main')).filter") == "grayscale(1)"
+    )
     page.close()
     cli.popen.send_signal(signal.SIGINT)
     assert cli.finish() == 130

@@ -154,8 +154,8 @@ def test_the_page_needs_nothing_but_what_is_served_here(served: Served) -> None:
     page.feed(body.decode())
     assert page.forbidden == []
     assert {"live.css", "live.js", "live.svg"} <= page.files
-    for file in page.files:
-        assert served.get(f"/{file}")[0] == 200
+    for name in page.files:
+        assert served.get(f"/{name}")[0] == 200
     for file in PAGE.iterdir():
         text = file.read_text().replace("http://www.w3.org/2000/svg", "")
         assert not re.search(r"https?:|//[a-z]+\.[a-z]", text), file
@@ -219,7 +219,8 @@ def test_no_name_or_two_names_are_refused(served: Served) -> None:
 
 
 @pytest.mark.parametrize(
-    "request_", ["nonsense\r\n\r\n", "GET / HTTP/9.9\r\n\r\n", "GET / x y z\r\n\r\n", f"GET /{'x' * 70000}"]
+    "request_",
+    ["nonsense\r\n\r\n", "GET / HTTP/9.9\r\n\r\n", "GET / x y z\r\n\r\n", f"GET /{'x' * 70000}"],
 )
 def test_what_is_no_request_is_refused_in_a_word(served: Served, request_: str) -> None:
     answer = served.raw(request_)
@@ -279,7 +280,7 @@ def test_so_many_pages_and_no_more(served: Served) -> None:
         assert served.get("/events")[0] == 503
         assert served.get("/")[0] == 200
         clients[0].close()  # noticed at the next heartbeat
-        until(lambda: served.news.enter())
+        until(served.news.enter)
         served.news.leave()
 
 

@@ -16,7 +16,9 @@ from recorder.process import RecorderProcess
 from wire.channels import SUMMARY, node_channels, plant_channels, width
 from wire.child import Child
 from wire.errors import ExitCode
+from wire.joints import TipConfig
 from wire.messages import PLANT, encode_batch, encode_counters, run_tag
+from wire.reference import TERMS, Leg, Reference
 from wire.run_config import (
     DisturbanceConfig,
     LinkConfig,
@@ -34,6 +36,7 @@ LAYOUT = {i: node_channels(i, NODES, FORWARD[i], BACKWARD[i]) for i in range(NOD
 PLANT_FIELDS = [
     (channel.topic, field) for channel in plant_channels(NODES) for field in channel.fields
 ]
+REST = Reference(0.1, [Leg(0.0, 0.0, np.zeros((TERMS, 7, 1)))])
 LATE = PLANT_FIELDS.index(("/plant/pace", "late"))
 SETPOINT = [field for channel in LAYOUT[0] for field in channel.fields].index("setpoint")
 
@@ -135,6 +138,7 @@ class Recorded:
             path=str(path),
             forward_widths=FORWARD,
             backward_widths=BACKWARD,
+            tip=TipConfig(REST.to_plain(), 0.35),
             flush_s=1.0,
             metadata={},
             attachments={},
