@@ -68,7 +68,7 @@ class LiveProcess:
         self._frames = FrameMaker(config)
         self._news = Broadcast(child.wake)
         self._alive: set[int] = set()
-        self._told_alive: set[int] | None = None
+        self._told_alive: set[int] = set()
         self._state: dict[str, Any] = {"state": "waiting", "message": "", "final": False}
         self._started_s: float | None = None
         self._started_ns: int | None = None
@@ -120,13 +120,16 @@ class LiveProcess:
 
     def _attend(self, session: Any) -> None:
         self._tell()
-        while not self._ended:
+        while True:
             self._hear(self._patience())
-            if self._child.stopping and not self._ended:
-                self._hear(0.0)  # the launcher's last word may have come with its signal
+            # Nodes leave after the launcher's last word was sent: heard now, it comes before their leaving.
+            alive = self._alive.copy()
+            self._hear(0.0)
+            if self._child.stopping or self._ended:
                 return
             self._listen(session)
-            if self._told_alive != self._alive:
+            if self._told_alive != alive:
+                self._told_alive = alive
                 self._tell()
             if monotonic() >= self._next_s and self._samples is not None:
                 self._next_s = monotonic() + PERIOD_S
@@ -150,17 +153,16 @@ class LiveProcess:
                 if self._news.watched and self._samples is not None:
                     self._take_all()
                     self._show()
-                self._tell(state=message["state"], message=message["message"], final=True)
                 self._ended = True
+                self._told_alive.difference_update(message["dead"])
+                self._tell(state=message["state"], message=message["message"], final=True)
 
     def _tell(self, **news: Any) -> None:
         """Publish where the run stands and which nodes' tokens are there."""
         self._state |= news
-        self._told_alive = self._alive.copy()
-        firsts = self._config.run.firsts
-        living = [max(f for f in firsts if f <= i) for i in range(self._config.run.nodes)]
-        alive = [first in self._told_alive for first in living]
-        about = {"run_id": self._config.run.run_id, "alive": alive}
+        run, every = self._config.run, self._config.run.segments_per_process
+        alive = [i - i % every in self._told_alive for i in range(run.nodes)]
+        about = {"run_id": run.run_id, "alive": alive}
         self._news.put("state", _encode(self._state | about))
 
     # -- telemetry --------------------------------------------------------------------------------

@@ -385,7 +385,7 @@ class Conductor:
 
     def _show(self, what: str, **about: str) -> None:
         """Tell the live page, if there is one, how the run goes on."""
-        self._order(self._live, do=what, **about)
+        self._order(self._live, do=what, dead=self._state.dead, **about)
 
     def _event(self, tick: int, level: str, name: str, text: str) -> None:
         self._order(self._recorder, do="event", tick=tick, level=level, name=name, message=text)

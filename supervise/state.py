@@ -97,6 +97,11 @@ class RunState:
         return [i for i, h in sorted(self.nodes.items()) if i not in self.stopped and h.alive]
 
     @property
+    def dead(self) -> list[int]:
+        """Nodes whose processes ended without being asked."""
+        return [i for i in self.plan.run.firsts if f"node {i}" in self.ended]
+
+    @property
     def silent(self) -> list[int]:
         """Senders from whom the recorder will hear nothing more (-1: the plant)."""
         if self.plant_stop is None:  # without the plant nothing reaches the recorder

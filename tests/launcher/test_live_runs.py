@@ -169,7 +169,12 @@ def test_a_node_that_dies_is_seen_and_the_stop_is_explained(start: Start) -> Non
     os.kill(cli.processes()["octarm-node2"], signal.SIGKILL)
     states = [content for kind, content in stream if kind == "state"]
     assert cli.finish() == 4
-    assert [True, True, False, True] in [state["alive"] for state in states]
+    assert states[-1]["alive"] == [
+        True,
+        True,
+        False,
+        True,
+    ]  # the others left when they were told to
     assert states[-1]["state"] == "safety_stop"
     assert "node 2 was ended by SIGKILL" in states[-1]["message"]
     assert states[-1]["message"] in cli.err
@@ -211,6 +216,32 @@ def test_pages_that_come_and_go_are_served_anew(start: Start) -> None:
     third = frame_after(again, second["tick"] + 30)
     assert third["ticks_seen"] < third["tick"]  # nobody has looked in between
     assert all(third["nodes"]["on_time"])
+    cli.popen.send_signal(signal.SIGINT)
+    assert cli.finish() == 130
+
+
+def wake_ups(pid: int) -> dict[str, int]:
+    """How often each thread has waited for something, but for Zenoh's, which keeps the link alive."""
+    found = {}
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        if (task / "comm").read_text().strip() == LIVE:
+            status = (task / "status").read_text()
+            found[task.name] = int(status.partition("voluntary_ctxt_switches:")[2].split()[0])
+    return found
+
+
+def test_while_nobody_watches_nothing_is_done(start: Start) -> None:
+    cli = start.run(*ENDLESS)
+    port = port_of(cli)
+    time.sleep(3.0)  # it has had everybody's first tick, or has given it up
+    pid = cli.processes()[LIVE]
+    before = wake_ups(pid)
+    time.sleep(1.0)
+    assert wake_ups(pid) == before
+    stream = events(port)
+    frame_after(stream, 0)
+    time.sleep(0.5)
+    assert wake_ups(pid) != before
     cli.popen.send_signal(signal.SIGINT)
     assert cli.finish() == 130
 
