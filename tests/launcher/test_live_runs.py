@@ -14,6 +14,7 @@ import pytest
 from in_process import octarm
 from live_frames import check_frame
 from live_page import address, events
+from test_hosts import SSH, write_hosts
 
 from analysis.compare import first_difference
 from analysis.recording import read_recording
@@ -218,6 +219,22 @@ def test_pages_that_come_and_go_are_served_anew(start: Start) -> None:
     assert all(third["nodes"]["on_time"])
     cli.popen.send_signal(signal.SIGINT)
     assert cli.finish() == 130
+
+
+def test_links_to_another_host_are_not_measured_with_two_clocks(
+    start: Start, tmp_path: Path
+) -> None:
+    hosts = write_hosts(tmp_path, SSH)
+    cli = start.run("--nodes", "4", "--ticks", "1000000", "--hosts", hosts, *SLOWLY)
+    frame = frame_after(events(port := port_of(cli)), 20)
+    for way in ("forward", "backward"):
+        known = [us is not None for us in frame["links"][f"{way}_us"]]
+        assert known == [True, False, False]
+    assert frame["nodes"]["late"][2:] == [0, 0]
+    cli.popen.send_signal(signal.SIGINT)
+    assert cli.finish() == 130
+    assert cli.gone() == {}
+    assert refused(port)
 
 
 def wake_ups(pid: int) -> dict[str, int]:
