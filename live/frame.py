@@ -108,11 +108,11 @@ class FrameMaker:
 
     # -- what goes --------------------------------------------------------------------------------
 
-    def frame(self, started_ns: int | None, *, running: bool) -> dict[str, Any] | None:
+    def frame(self, started_ns: float | None, *, running: bool) -> dict[str, Any] | None:
         """The frame of now; None while there is nothing new.
 
-        started_ns: when the run began, on the clock and from the epoch of the telemetry. running: whether
-        something should come, so that it is told when nothing does.
+        started_ns: about when the run began, on the clock and from the epoch of the telemetry, for want of the
+        first tick. running: whether something should come, so that it is told when nothing does.
         """
         rows, now = self.rows, monotonic()
         ticks = rows.complete(after=self._since)
@@ -122,16 +122,19 @@ class FrameMaker:
             self._counted, self._moved_at = int(fresh[-1]), now
         elif not running or now - self._moved_at < STUCK_S or rows.newest[-1] == NEVER:
             return None
-        tick = int(rows.newest[-1]) if not fresh.size else self._counted
+        if fresh.size:
+            tick = said = self._counted
+        else:
+            tick, said = int(rows.newest[-1]), int(rows.newest[:-1].min())
         of = rows.last if not fresh.size else (lambda sender: rows.of(sender, tick))
         own = {i: row for i in range(self._run.nodes) if (row := of(i)) is not None}
         truth = rows.of(PLANT, tick)
         shape = truth[self._shape].reshape(-1, 2)
-        joints = self._joints.points(tick, {i: row.tolist() for i, row in own.items()})
+        joints = self._joints.points(said, {i: row.tolist() for i, row in own.items()})
         x, y, error, wanted_x, wanted_y = truth[self._tip].tolist()
         frame: dict[str, Any] = {
             "tick": tick,
-            "time_s": _significant(tick * self._run.tick_s),
+            "time_s": round(tick * self._run.tick_s, 6),
             "setpoint": int(own[0][self._setpoint]) if 0 in own else None,
             "late": bool(truth[self._late]),
             "late_ticks": self._late_ticks,
@@ -141,7 +144,7 @@ class FrameMaker:
             "tip_error_m": _significant(error),
             "shape": _listed(shape, METRES),
             "joints": None if joints is None else _listed(np.asarray(joints), METRES),
-            "estimate_tick": tick if fresh.size else int(rows.newest[:-1].min()),
+            "estimate_tick": said,
             "curvature": _listed(self._states(truth)[:, CURVATURE], CURVATURES),
             "curvature_estimate": [
                 round(float(own[i][self._estimate][CURVATURE]), CURVATURES) if i in own else None
@@ -150,6 +153,8 @@ class FrameMaker:
             "links": self._latencies(ticks),
             "nodes": self._health(now),
         }
+        if PLANT in self._firsts:
+            started_ns = self._firsts[PLANT][self._began]
         if started_ns is not None:
             frame["wall_s"] = round(float(truth[self._began] - started_ns) * 1e-9, 4)
         if fresh.size and joints is not None:

@@ -34,7 +34,7 @@ from wire.run_config import LiveConfig
 
 PERIOD_S = 0.08
 """Between two frames: 12.5 a second."""
-BATCHES = 16
+BATCHES = 8
 """Of each process may wait in Zenoh's ring; in a burst the oldest make room."""
 DRAIN_S = 0.05
 FIRST_S = 2.0

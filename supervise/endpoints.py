@@ -177,14 +177,13 @@ def port_taken(port: int, address: str = LOOPBACK) -> str | None:
     return None
 
 
-def live_port(port: int | None) -> int:
-    """The port for the live page, 0 for any that is free; UsageError if the one that is asked for is taken."""
+def check_live_port(port: int | None) -> None:
+    """Raise UsageError if the port that is asked for the live page is taken; None and 0 ask for any."""
     if port and (reason := port_taken(port)):
         raise UsageError(
             f"--live-port {port}: port {port} of {LOOPBACK} cannot be used ({reason}); give another or "
             "leave it out"
         )
-    return port or 0
 
 
 def _free_base(count: int, address: str = LOOPBACK) -> int | None:

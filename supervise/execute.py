@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from supervise.conductor import Conductor, Interrupted, log_of
-from supervise.endpoints import Endpoints, choose, live_port, over_hosts
+from supervise.endpoints import Endpoints, check_live_port, choose, over_hosts
 from supervise.options import RunOptions
 from supervise.plan import Plan, make_plan, new_run_id, prepare
 from supervise.state import Outcome
@@ -37,7 +37,7 @@ class Result:
 
 def execute(options: RunOptions, *, quiet: bool, plot: bool) -> Result:
     """Run the arm once. Raises OctarmError if it did not come to the first tick."""
-    live_port(options.live_port)
+    check_live_port(options.live_port)
     prepared = prepare(options)
     run_id = new_run_id()
     endpoints = _meet(options)

@@ -35,6 +35,7 @@ class Page {
     this.frame = null;
     this.cameAt = 0;
     this.gap = 100;
+    this.timer = 0;
     const pace = facts.period_s === null ? "lock-step" : `real time, a tick every ${number(facts.period_s)} s`;
     put("run", `${facts.run_id} \u00b7 ${facts.scenario} \u00b7 ${facts.nodes} nodes \u00b7 tick ${number(facts.tick_s)} s \u00b7 ${pace} \u00b7 gains ${facts.gains_sha256.slice(0, 12)}`);
     put("ticks", `of ${facts.ticks}`);
@@ -63,7 +64,8 @@ class Page {
     const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     const share = still || this.gap < SLOW_MS ? 1 : (performance.now() - this.cameAt) / this.gap;
     this.arm.draw(this.frame === null ? null : between(this.before, this.frame, share));
-    if (share < 1) setTimeout(() => requestAnimationFrame(() => this.drawArm()), FLUENT_MS);
+    clearTimeout(this.timer);
+    if (share < 1) this.timer = setTimeout(() => this.drawArm(), FLUENT_MS);
   }
 
   drawAll() {
@@ -156,6 +158,7 @@ function follow(page, facts) {
     }
   });
   source.addEventListener("frame", (event) => {
+    if (performance.now() - heard > SILENCE_MS) tell();
     heard = performance.now();
     page.takeFrame(JSON.parse(event.data));
   });
@@ -163,6 +166,10 @@ function follow(page, facts) {
     heard = performance.now();
     tell();
   });
+  setInterval(() => {
+    if (over || last === null || last.state !== "running" || performance.now() - heard < SILENCE_MS) return;
+    show("lost", "no news", "nothing has come for some seconds, though the run should go on; what is shown is the last that came");
+  }, 1000);
   source.addEventListener("error", () => {
     if (!over) show("lost", "connection lost", source.readyState === EventSource.CLOSED
       ? "the stream was refused: too many pages are open, or the run is over" : LOST);

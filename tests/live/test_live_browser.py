@@ -141,8 +141,14 @@ def test_a_lost_connection_is_said_and_greys_the_page(start: Start, browser: Any
     cli = start.run(*RUN, "1000000")
     visit = Visit(browser, url_of(cli))
     visit.wait_for_tick(5)
-    os.kill(cli.processes()["octarm-live"], signal.SIGKILL)
-    page = visit.page
+    page, pid = visit.page, cli.processes()["octarm-live"]
+    os.kill(pid, signal.SIGSTOP)
+    expect(page.locator("#state")).to_have_text("no news", timeout=10_000)
+    expect(page.locator("body")).to_have_class("lost")
+    os.kill(pid, signal.SIGCONT)
+    expect(page.locator("body")).to_have_class("running")
+    expect(page.locator("#banner")).to_be_hidden()
+    os.kill(pid, signal.SIGKILL)
     expect(page.locator("body")).to_have_class("lost")
     expect(page.locator("#state")).to_have_text("connection lost")
     expect(page.locator("#banner")).to_contain_text("without a word about the run's end")
