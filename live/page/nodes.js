@@ -16,7 +16,7 @@ export class NodeCells {
     this.shown = null;
     this.cells = {};
     box.classList.toggle("many", this.count > MANY);
-    box.style.gridTemplateColumns = `auto repeat(${this.count}, minmax(3px, 1fr))`;
+    box.style.gridTemplateColumns = `auto repeat(${this.count}, minmax(2px, 1fr))`;
     box.append(label(""));
     const every = this.count <= MANY ? 1 : 10 ** Math.ceil(Math.log10(this.count / 12));
     for (let i = 0; i < this.count; i += 1) {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Iterator
 from random import Random
 from types import SimpleNamespace
@@ -15,6 +16,9 @@ from simulated_run import Scenario, write_recording
 from analysis.recording import Recording, read_recording
 from live.frame import STUCK_S, FrameMaker, lagrange
 from live.latency import measurable
+from live.process import LiveProcess
+from wire.child import Child
+from wire.errors import OctarmError
 from wire.messages import PLANT, Batch
 from wire.run_config import LegConfig
 
@@ -267,6 +271,15 @@ def test_a_batch_that_comes_twice_changes_nothing(
     seen = maker._seen
     until(maker, rows, dict.fromkeys(rows, 20))
     assert maker._seen == seen == 20
+
+
+def test_a_port_that_was_taken_since_it_was_tried_is_named(recording: Recording) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        child = Child("live", control=-1, status=-1, directory=None)
+        with pytest.raises(OctarmError, match=rf"--live-port {port}: .* cannot be used \("):
+            LiveProcess(live_config(recording, port=port), child).run()
+        child.close()
 
 
 @pytest.mark.parametrize("power", range(4))
