@@ -60,6 +60,8 @@ def run(
     sched: Literal["other", "fifo"] = "other",
     no_pin: Flag = False,
     hosts: Path | None = RunOptions.hosts,
+    live: Flag = RunOptions.live,
+    live_port: int | None = RunOptions.live_port,
 ) -> int:
     """Run the arm: one process a segment, a plant and a recorder; leaves a recording and a plot.
 
@@ -100,6 +102,8 @@ def run(
         sched: Scheduling of plant and nodes: other (ordinary) or fifo (real-time, where it is permitted).
         no_pin: Leave the nodes' cores to the scheduler.
         hosts: Hosts file (TOML): which nodes run on which machine, over TCP; see docs/hosts.md.
+        live: Show the running arm on a web page of this machine, best with --realtime; see docs/live.md.
+        live_port: Port of that page on 127.0.0.1; default: a free one.
     """
     from supervise.execute import execute
 
@@ -132,6 +136,8 @@ def run(
         period_s=period,
         hold_ticks=hold_ticks,
         hosts=hosts,
+        live=live,
+        live_port=live_port,
     )
     result = execute(options, quiet=quiet or json, plot=not no_plot)
     outcome = result.outcome

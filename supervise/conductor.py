@@ -41,6 +41,14 @@ GRACE_S = 1.0
 """Between SIGINT, SIGTERM and SIGKILL."""
 
 
+_ENDINGS = {
+    ExitCode.OK: "finished",
+    ExitCode.DEGRADED: "finished",
+    ExitCode.INTERRUPTED: "interrupted",
+}
+"""What the live page calls an exit code; any other is a safety stop."""
+
+
 class Interrupted(Exception):  # noqa: N818 - not an error
     """Ctrl-C or SIGTERM."""
 
@@ -59,6 +67,7 @@ class Conductor:
         """By the names of their hosts."""
         self._plant: Process | None = None
         self._recorder: Process | None = None
+        self._live: Process | None = None
         self._state = RunState(plan)
         self._noted: set[str] = set()
         self._interrupts = 0
@@ -76,8 +85,16 @@ class Conductor:
         }
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(
+        self, _kind: type[BaseException] | None, error: BaseException | None, _trace: object
+    ) -> None:
         self._leaving = True
+        # Heard only by a page that has not been told how the run ended.
+        self._show(
+            "finish",
+            state="failed",
+            message=f"it did not begin: {str(error or '') or 'interrupted'}",
+        )
         try:
             self._end_all()
         finally:
@@ -115,15 +132,22 @@ class Conductor:
         self._view.note(f"{nodes}, plant and recorder linked in {monotonic() - began:.2f} s")
         self._event(0, "info", "started", f"{self._plan.run.nodes} nodes linked")
         self._order(self._plant, do="start")
+        self._show("start")
         first = monotonic()
         self._watch()
         run_s = monotonic() - first
         self._collect_reports()
         code, message, tick = self._state.verdict(interrupted=self._interrupts > 0)
+        self._show("ending", message=message)
         self._finish_recording(code, message, tick)
         troubles = (self._state.recording_trouble(), self._state.pace_trouble())
         if code is ExitCode.OK and any(troubles):
             code, message = ExitCode.DEGRADED, "; ".join(filter(None, troubles))
+        self._show(
+            "finish",
+            state=_ENDINGS.get(code, "safety_stop"),
+            message=message or f"all {tick} ticks done",
+        )
         return Outcome(code, message, tick, run_s)
 
     def _spawn(self) -> None:
@@ -142,6 +166,9 @@ class Conductor:
         self._recorder = self._start("recorder", "recorder", own)
         self._plant.tell(dumps(plan.plant))
         self._recorder.tell(dumps(plan.recorder))
+        if plan.live is not None:
+            self._live = self._start("live", "live", own)
+            self._live.tell(dumps(plan.live))
         for host in plan.hosts:
             zygote = self._far.get(host.name, self._zygote)
             hand = plan.by_hand.intersection(host.indices)
@@ -228,14 +255,15 @@ class Conductor:
             self._let_go(far)
         own = [h for h in self._state.nodes.values() if isinstance(h, Handle)]
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-            self._end(number, [*own, self._plant, self._recorder])
+            self._end(number, [*own, self._plant, self._recorder, self._live])
         # Last the zygotes, which end whatever they have forked in the meantime.
         if self._zygote is not None:
             self._zygote.control.close()
         self._await_end([far for far in self._far.values() if far.up], ZYGOTE_GRACE_S)
         self._end(signal.SIGTERM, [self._zygote, *self._far.values()], ZYGOTE_GRACE_S)
         self._end(signal.SIGKILL, [self._zygote, *self._far.values(), *own])
-        for process in (self._zygote, *self._far.values(), self._plant, self._recorder):
+        direct = (self._zygote, *self._far.values(), self._plant, self._recorder, self._live)
+        for process in direct:
             if process is not None:
                 self._forget(process)
                 process.reap()
@@ -308,6 +336,8 @@ class Conductor:
             self._state.ended[process.name] = how
             if process is self._recorder and self._state.all_linked:
                 self._view.note(f"the recorder {ending(code)}: the run goes on unrecorded")
+            if process is self._live and self._state.all_linked:
+                self._view.note(f"the live page {ending(code)}: the run goes on unseen")
 
     def _read(self, process: Process) -> None:
         lines = process.lines()
@@ -337,6 +367,8 @@ class Conductor:
                     far.close()
                 if not self._leaving:
                     state.ended[f"node {node}"] = ending(line["code"])
+            case "listening":
+                self._view.say(f"live at {line['url']}")
             case "progress" if line["from"] == "plant":
                 self._view.progress(line["tick"])
             case "progress":
@@ -350,6 +382,10 @@ class Conductor:
     def _order(self, process: Process | None, **message: Any) -> None:
         if process is not None and process.alive:
             process.order(**message)
+
+    def _show(self, what: str, **about: str) -> None:
+        """Tell the live page, if there is one, how the run goes on."""
+        self._order(self._live, do=what, dead=self._state.dead, **about)
 
     def _event(self, tick: int, level: str, name: str, text: str) -> None:
         self._order(self._recorder, do="event", tick=tick, level=level, name=name, message=text)

@@ -177,6 +177,15 @@ def port_taken(port: int, address: str = LOOPBACK) -> str | None:
     return None
 
 
+def check_live_port(port: int | None) -> None:
+    """Raise UsageError if the port that is asked for the live page is taken; None and 0 ask for any."""
+    if port and (reason := port_taken(port)):
+        raise UsageError(
+            f"--live-port {port}: port {port} of {LOOPBACK} cannot be used ({reason}); give another or "
+            "leave it out"
+        )
+
+
 def _free_base(count: int, address: str = LOOPBACK) -> int | None:
     """The first of so many free ports in a row, None if none were found."""
     for _ in range(100):

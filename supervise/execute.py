@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from supervise.conductor import Conductor, Interrupted, log_of
-from supervise.endpoints import Endpoints, choose, over_hosts
+from supervise.endpoints import Endpoints, check_live_port, choose, over_hosts
 from supervise.options import RunOptions
 from supervise.plan import Plan, make_plan, new_run_id, prepare
 from supervise.state import Outcome
@@ -37,12 +37,17 @@ class Result:
 
 def execute(options: RunOptions, *, quiet: bool, plot: bool) -> Result:
     """Run the arm once. Raises OctarmError if it did not come to the first tick."""
+    check_live_port(options.live_port)
     prepared = prepare(options)
     run_id = new_run_id()
     endpoints = _meet(options)
     try:
         directory, made = _make_directory(options.out, run_id)
         with choose_view(prepared.course.ticks, quiet=quiet) as view:
+            if options.live and not options.realtime:
+                view.note(
+                    "--live: in lock-step the run is over as soon as it can be; to watch it add --realtime"
+                )
             try:
                 outcome = _conduct(make_plan(prepared, endpoints, run_id, directory), view)
             except BaseException:

@@ -57,6 +57,9 @@ class RunOptions:
     """None: the tick, that is one second of the arm's in one of the clock's."""
     hold_ticks: int = 2
     hosts: Path | None = None
+    live: bool = False
+    live_port: int | None = None
+    """None: any that is free."""
 
     def __post_init__(self) -> None:
         from plant.disturbance import DisturbanceSpec
@@ -91,6 +94,13 @@ class RunOptions:
                 every = self.segments_per_process
                 which = "" if every == 1 else f", a multiple of {every} (the first segment of each)"
                 raise UsageError(f"--by-hand {node}: expected a node 0..{self.nodes - 1}{which}")
+        if self.live_port is not None:
+            if not self.live:
+                raise UsageError("--live-port is for --live; add it or leave the port out")
+            if not 0 <= self.live_port <= 65_535:
+                raise UsageError(
+                    f"--live-port: expected 0 (any that is free) or a port up to 65535, got {self.live_port}"
+                )
         if self.initial is not None:
             check_name(self.initial)
         amplitude = self.disturbance_amplitude

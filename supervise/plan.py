@@ -31,7 +31,9 @@ from wire.errors import UsageError
 from wire.joints import TipConfig
 from wire.placement import FIFO_PRIORITY
 from wire.run_config import (
+    GoalConfig,
     LinkConfig,
+    LiveConfig,
     NodeConfig,
     PaceConfig,
     PlantConfig,
@@ -43,6 +45,8 @@ from wire.run_config import (
 )
 
 BATCH_TICKS = 32
+GOAL_POINTS = 65
+"""Of a setpoint's shape on the live page."""
 CORES = 2
 """Two sweeps run towards each other; more cores would only add wake-ups across cores (runtime
 figures)."""
@@ -56,6 +60,8 @@ class Plan:
     nodes: tuple[NodeConfig, ...]
     plant: PlantConfig
     recorder: RecorderConfig
+    live: LiveConfig | None
+    """Of the process that shows the run; None: nobody wants to see it."""
     endpoints: Endpoints
     directory: Path
     """Where the recording and everything else about the run goes."""
@@ -203,6 +209,9 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         )
 
     configs = tuple(node(i) for i in run.firsts)
+    forward_widths = tuple(f.forward_received for f in deployment.nodes)
+    backward_widths = tuple(f.backward_received for f in deployment.nodes)
+    tip = TipConfig(references.nodes[-1].to_plain(), deployment.nodes[-1].bend_m)
     return Plan(
         run=run,
         nodes=configs,
@@ -221,9 +230,9 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         recorder=RecorderConfig(
             run=run,
             path=str(directory / "recording.mcap"),
-            forward_widths=tuple(f.forward_received for f in deployment.nodes),
-            backward_widths=tuple(f.backward_received for f in deployment.nodes),
-            tip=TipConfig(references.nodes[-1].to_plain(), deployment.nodes[-1].bend_m),
+            forward_widths=forward_widths,
+            backward_widths=backward_widths,
+            tip=tip,
             flush_s=FLUSH_S,
             metadata=_metadata(prepared, run, epoch_ns, () if placed is None else hosts),
             attachments={
@@ -231,6 +240,18 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
                 "run.json": dumps(run),
                 NODES_ATTACHMENT: f"[{','.join(map(dumps, configs))}]",
             },
+            links=links([], [endpoints.plant]),
+        ),
+        live=None
+        if not options.live
+        else LiveConfig(
+            run=run,
+            port=options.live_port or 0,
+            forward_widths=forward_widths,
+            backward_widths=backward_widths,
+            tip=tip,
+            goals=_goals(prepared),
+            elsewhere=tuple(sorted(elsewhere)),
             links=links([], [endpoints.plant]),
         ),
         endpoints=endpoints,
@@ -248,6 +269,28 @@ def _pace(options: RunOptions) -> PaceConfig | None:
         return None
     period_s = options.tick_s if options.period_s is None else options.period_s
     return PaceConfig(period_s, options.hold_ticks)
+
+
+def _goals(prepared: Prepared) -> tuple[GoalConfig, ...]:
+    """The setpoints that the run visits, as shapes."""
+    from analysis.goals import setpoint_shape
+
+    artefact = prepared.artefact
+    visited = sorted({artefact.setpoint_index(name) for name in prepared.course.visited})
+    return tuple(
+        GoalConfig(
+            index,
+            tuple(
+                map(
+                    tuple,
+                    setpoint_shape(
+                        artefact.setpoints[index], artefact.arm.length_m, GOAL_POINTS
+                    ).tolist(),
+                )
+            ),
+        )
+        for index in visited
+    )
 
 
 def _cores(nodes: int) -> list[int | None]:

@@ -70,6 +70,8 @@ class RunState:
                 self.waiting.setdefault(name, ["its links"])
                 if name == "recorder":
                     self.ready.add(name)
+            case "failed" if name == "live" and self.all_linked:
+                return  # the run does not need it; its end is told
             case "failed":
                 self.failures.append(line["message"])
             case "progress" if name == "plant":
@@ -86,12 +88,18 @@ class RunState:
     def all_linked(self) -> bool:
         """Whether the run can begin."""
         own = len(self.plan.nodes) - len(self.plan.by_hand)
-        return len(self.linked) == own and "plant" in self.ready
+        shown = self.plan.live is None or "live" in self.ready
+        return len(self.linked) == own and "plant" in self.ready and shown
 
     @property
     def unheard(self) -> list[int]:
         """Nodes that live but have not said their last words."""
         return [i for i, h in sorted(self.nodes.items()) if i not in self.stopped and h.alive]
+
+    @property
+    def dead(self) -> list[int]:
+        """Nodes whose processes ended without being asked."""
+        return [i for i in self.plan.run.firsts if f"node {i}" in self.ended]
 
     @property
     def silent(self) -> list[int]:
@@ -120,7 +128,8 @@ class RunState:
                 parts.append(f"{name} was not started (it is yours: {why})")
             else:
                 parts.append(f"{name} does not answer")
-        for name in ("plant", "recorder"):
+        shown = () if self.plan.live is None else ("live",)
+        for name in ("plant", "recorder", *shown):
             if name in self.ready:
                 continue
             if name not in self.waiting:
@@ -140,7 +149,7 @@ class RunState:
         """Why the arm must be stopped now, None if nothing happened."""
         if self.failures:
             return self.failures[0]
-        dead = [name for name in self.ended if name != "recorder"]
+        dead = [name for name in self.ended if name not in ("recorder", "live")]
         return f"{dead[0]} {self.ended[dead[0]]}" if dead else None
 
     def verdict(self, *, interrupted: bool) -> tuple[ExitCode, str, int]:

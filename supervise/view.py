@@ -38,6 +38,10 @@ class View:
     def note(self, text: str) -> None:
         """Say one thing."""
 
+    def say(self, text: str) -> None:
+        """Say one thing that is asked for even where progress is not."""
+        print(text, file=sys.stderr, flush=True)
+
     def progress(self, tick: int) -> None:
         """The plant has done this many ticks."""
         now = monotonic()
@@ -101,6 +105,10 @@ class TerminalView(View):
         )
         self._task = self._progress.add_task("run", total=ticks, state="")
         self._progress.start()
+
+    def say(self, text: str) -> None:
+        """Say one thing above the bar."""
+        self.note(text)
 
     def note(self, text: str) -> None:
         """Say one thing above the bar."""

@@ -287,6 +287,38 @@ class RecorderConfig:
     links: LinkConfig
 
 
+@dataclass(frozen=True)
+class GoalConfig:
+    """A setpoint that the run visits, to be drawn behind the arm."""
+
+    setpoint: int
+    """Its index among the run's setpoint_names."""
+    shape_m: tuple[tuple[float, ...], ...]
+    """Points (x, y) from root to tip."""
+
+
+@dataclass(frozen=True)
+class LiveConfig:
+    """What the process of the live page needs: the run, how wide each node's records are, what it draws."""
+
+    run: RunConfig
+    port: int
+    """Of 127.0.0.1; 0: any that is free."""
+    forward_widths: tuple[int, ...]
+    """Numbers in the forward sum that each node receives (0 at the root)."""
+    backward_widths: tuple[int, ...]
+    """Numbers in the backward sum that each node receives (0 at the tip)."""
+    tip: TipConfig
+    goals: tuple[GoalConfig, ...]
+    elsewhere: tuple[int, ...]
+    """Segments on machines with clocks of their own: what they measure cannot be compared."""
+    links: LinkConfig
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.port <= 65_535:
+            raise UsageError(f"port: expected 0..65535, got {self.port}")
+
+
 def dumps(config: Any) -> str:
     """A configuration as one line of JSON; bytes become {"base64": text}."""
     data = dataclasses.asdict(config)
