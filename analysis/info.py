@@ -17,13 +17,13 @@ import msgspec
 import numpy as np
 
 from analysis.info_flow import message_kinds, process_rows
-from analysis.link_latency import Array, percentiles_ms
-from analysis.link_times import link_facts
+from analysis.link_times import link_facts, percentiles_ms
 from analysis.recording import ENDINGS
 from analysis.survey import RECOVERED, Survey, configuration_of, survey, ticks_of
 from analysis.table import Table, decode_table
 from wire.channels import METADATA, PACE, SUMMARY, SWEEP_TIMING
 from wire.errors import UsageError
+from wire.link_latency import Array
 from wire.run_config import RunConfig
 
 EVENTS = "/event"

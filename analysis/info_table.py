@@ -6,7 +6,8 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from analysis.link_latency import CLOCKS, IN_MEMORY, SHARES
+from analysis.link_times import SHARES
+from wire.link_latency import CLOCKS, IN_MEMORY
 
 WIDTH = 118
 MOST_EVENTS = 12

@@ -1,6 +1,6 @@
 """The latencies of a recorded run's links: tables of /node/NN/timing in, percentiles and the worst link out.
 
-Part of `analysis.info`; the arithmetic is `analysis.link_latency`'s.
+Part of `analysis.info`; the arithmetic is `wire.link_latency`'s.
 """
 
 from __future__ import annotations
@@ -11,20 +11,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from analysis.link_latency import (
-    CLOCKS,
-    IN_MEMORY,
-    MESSAGES,
-    Array,
-    link_kinds,
-    link_latencies,
-    percentiles_ms,
-)
 from analysis.table import Table
 from wire.channels import label
 from wire.errors import UsageError
+from wire.link_latency import CLOCKS, IN_MEMORY, MESSAGES, Array, link_kinds, link_latencies
 from wire.run_config import RunConfig
 
+SHARES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 WORST_BY = "p99"
 _INSTANTS = tuple(f"{what}_received_wall_ns" for what in ("measurement", "forward", "backward"))
 
@@ -37,7 +30,7 @@ def link_facts(
     `left_out` counts links without a latency by reason: in one process ("in memory"), or between clocks that
     cannot be compared ("clocks"); `unrecorded` have no tick with both instants.
     """
-    own = _own_clocks(facts.get("hosts"), run.nodes, notes)
+    own = own_clocks(facts.get("hosts"), run.nodes, notes)
     kinds = link_kinds(run.nodes, run.firsts, own)
     y, c, d = (_instants(tables, run, field) for field in _INSTANTS)
     found = link_latencies(y, c, d)
@@ -62,8 +55,11 @@ def link_facts(
     }
 
 
-def _own_clocks(hosts: str | None, nodes: int, notes: list[str]) -> frozenset[int]:
-    """Nodes whose instants count from their own first measurement; hosts have consecutive nodes."""
+def own_clocks(hosts: str | None, nodes: int, notes: list[str]) -> frozenset[int]:
+    """Nodes whose instants count from their own first measurement; hosts have consecutive nodes.
+
+    `hosts` is the metadata's text, None without; what is wrong with it is added to the notes.
+    """
     if hosts is None:
         return frozenset()
     try:
@@ -101,3 +97,13 @@ def _instants(tables: Mapping[str, Table], run: RunConfig, field: str) -> Array:
         except UsageError:
             continue
     return out
+
+
+def percentiles_ms(durations_ns: Array) -> dict[str, float] | None:
+    """The percentiles of `SHARES` in ms, NaN left out; None if nothing is left."""
+    values = durations_ns[np.isfinite(durations_ns)]
+    if values.size == 0:
+        return None
+    return dict(
+        zip(SHARES, (1e-6 * np.percentile(values, [*SHARES.values()])).tolist(), strict=True)
+    )

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from live.latency import SENT, Instants, link_latencies, measurable
+from live.latency import SENT, C, D, Instants, Y
 from live.rows import NEVER, Array, Ints, RecentRows
 from wire.channels import BATCH_NS, SHAPE_POINTS, STATE, columns_of, label
 from wire.joints import Joints
+from wire.link_latency import MESSAGES, link_kinds, link_latencies
 from wire.messages import PLANT, Batch
 from wire.run_config import LiveConfig
 
@@ -38,11 +39,14 @@ class FrameMaker:
 
     def __init__(self, config: LiveConfig) -> None:
         run = self._run = config.run
-        self.rows = RecentRows(run.nodes, config.forward_widths, config.backward_widths)
-        self._period_s = run.tick_s if run.pace is None else run.pace.period_s
+        self.rows = RecentRows(
+            run.nodes, config.forward_widths, config.backward_widths, config.replay_from
+        )
+        self._period_s = config.period_s
         self._joints = Joints(config.forward_widths, config.tip)
         self._instants = Instants(self.rows)
-        self._links = np.array(measurable(run.nodes, run.firsts, config.elsewhere), dtype=bool)
+        kinds = link_kinds(run.nodes, run.firsts, frozenset(config.elsewhere))
+        self._links = [kind == MESSAGES for kind in kinds]
         self._elsewhere = np.isin(np.arange(run.nodes), config.elsewhere)
         self._onto_faces = lagrange(np.asarray(run.faces_m) / run.faces_m[-1], SHAPE_POINTS)
         self._weights = np.asarray(run.energy_weights)
@@ -73,8 +77,12 @@ class FrameMaker:
         """Take a batch of rows."""
         if batch.tick == 0:
             self._note_first(batch)
+        again = self.rows.begins_again(batch)
         if not self.rows.add(batch) or batch.sender != PLANT:
             return
+        if again:
+            self._sweeps.clear()
+            self._since = self._counted = NEVER
         rows = batch.rows
         self._seen += len(rows)
         self._late_ticks += int(rows[:, self._late].sum())
@@ -167,7 +175,7 @@ class FrameMaker:
             return
         due = self.rows.of(PLANT, fresh)[:, self._due]
         sent = self._instants.at(fresh)[:, :, SENT]
-        late = (sent > due[:, None] + 1e9 * self._period_s).sum(axis=0)
+        late = (sent > due[:, None] + 1e9 * self._run.pace.period_s).sum(axis=0)
         late[self._elsewhere] = 0
         self._lateness += late
         self._trouble_at[late > 0] = now
@@ -217,16 +225,16 @@ class FrameMaker:
         if not ticks.size:
             return dict.fromkeys(names, unknown) | {"ticks": 0}
         out: dict[str, Any] = {"ticks": int(ticks.size)}
-        for name, latencies in zip(
-            ("forward", "backward"), link_latencies(self._instants.at(ticks)), strict=True
-        ):
+        instants = self._instants.at(ticks)
+        found = link_latencies(*(instants[:, :, which] for which in (Y, C, D)))
+        for name, latencies in (("forward", found.forward_ns), ("backward", found.backward_ns)):
             for word, figures in (
                 ("us", np.median(latencies, axis=0)),
                 ("most_us", latencies.max(axis=0)),
             ):
                 out[f"{name}_{word}"] = [
                     round(figure * 1e-3, 1) if known else None
-                    for figure, known in zip(figures.tolist(), self._links.tolist(), strict=True)
+                    for figure, known in zip(figures.tolist(), self._links, strict=True)
                 ]
         return out
 

@@ -144,8 +144,8 @@ class LiveProcess:
         for message in self._child.wait(seconds):
             if message.get("do") == "start":
                 self._started_s = monotonic()
-                epoch_ns = self._config.links.epoch_ns or 0
-                self._started_ns = monotonic_ns() - epoch_ns
+                if self._config.replay_from is None:  # a recording's instants are of another time
+                    self._started_ns = monotonic_ns() - (self._config.links.epoch_ns or 0)
                 self._tell(state="running")
             elif message.get("do") == "ending":
                 self._tell(state="ending", message=message["message"])
@@ -174,7 +174,10 @@ class LiveProcess:
         """
         started = self._started_s
         first = (
-            started is not None and self._frames.awaits_first and monotonic() - started < FIRST_S
+            started is not None
+            and self._config.replay_from is None  # which waits for somebody who watches
+            and self._frames.awaits_first
+            and monotonic() - started < FIRST_S
         )
         wanted = started is not None and (self._news.watched or first)
         if wanted and self._samples is None:
@@ -230,6 +233,7 @@ def run_facts(config: LiveConfig) -> dict[str, Any]:
         "tick_s": run.tick_s,
         "ticks": run.ticks,
         "period_s": None if run.pace is None else run.pace.period_s,
+        "replay": config.replay_from is not None,
         "control": run.control,
         "setpoint_names": list(run.setpoint_names),
         "setpoint": run.setpoint_index,

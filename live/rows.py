@@ -28,10 +28,19 @@ class RecentRows:
     """Rows of plant and nodes by tick.
 
     forward, backward: (n,) numbers in the sums that each node receives, as in `wire.channels.node_channels`.
+    again_from: the tick with which a recording begins that may be published several times; None for a run,
+    which begins once.
     """
 
-    def __init__(self, nodes: int, forward: Sequence[int], backward: Sequence[int]) -> None:
+    def __init__(
+        self,
+        nodes: int,
+        forward: Sequence[int],
+        backward: Sequence[int],
+        again_from: int | None = None,
+    ) -> None:
         self.nodes = nodes
+        self._again_from = again_from
         self.layout: dict[int, list[Channel]] = {
             i: node_channels(i, nodes, forward[i], backward[i]) for i in range(nodes)
         }
@@ -49,6 +58,8 @@ class RecentRows:
     def add(self, batch: Batch) -> bool:
         """Take a batch; False if its ticks are older than what is here."""
         column = self._column(batch.sender)
+        if self.begins_again(batch):
+            self._ticks[:, column] = self.newest[column] = NEVER
         last = batch.tick + len(batch.rows) - 1
         if last <= self.newest[column]:
             return False
@@ -60,6 +71,11 @@ class RecentRows:
         self.newest[column] = last
         self.arrived_s[column] = monotonic()
         return True
+
+    def begins_again(self, batch: Batch) -> bool:
+        """Whether the sender is at the beginning of a recording again, before `add` has taken the batch."""
+        newest = self.newest[self._column(batch.sender)]
+        return batch.tick == self._again_from and bool(newest > batch.tick)
 
     def complete(self, after: int = NEVER) -> Ints:
         """Ticks beyond `after` of which everybody's row is there, in order."""

@@ -41,11 +41,15 @@ class Handle:
     @property
     def alive(self) -> bool:
         """Whether the process still runs."""
+        return not self.wait(0.0)
+
+    def wait(self, seconds: float | None = None) -> bool:
+        """Wait for the end, None: as long as it takes; whether it has come."""
         if self._fd < 0:
-            return False
+            return True
         poll = select.poll()
         poll.register(self._fd, select.POLLIN)
-        return not poll.poll(0)
+        return bool(poll.poll(None if seconds is None else 1e3 * seconds))
 
     def signal(self, number: signal.Signals) -> None:
         """Send a signal; nothing happens if the process has ended."""

@@ -10,6 +10,7 @@ import math
 import os
 import secrets
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -250,8 +251,10 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             forward_widths=forward_widths,
             backward_widths=backward_widths,
             tip=tip,
-            goals=_goals(prepared),
+            goals=goals_of(artefact, sorted(run.scheduling.setpoints)),
             elsewhere=tuple(sorted(elsewhere)),
+            period_s=run.tick_s if run.pace is None else run.pace.period_s,
+            replay_from=None,
             links=links([], [endpoints.plant]),
         ),
         endpoints=endpoints,
@@ -271,26 +274,13 @@ def _pace(options: RunOptions) -> PaceConfig | None:
     return PaceConfig(period_s, options.hold_ticks)
 
 
-def _goals(prepared: Prepared) -> tuple[GoalConfig, ...]:
-    """The setpoints that the run visits, as shapes."""
+def goals_of(artefact: GainsArtefact, indices: Sequence[int]) -> tuple[GoalConfig, ...]:
+    """Setpoints as shapes, for the live page."""
     from analysis.goals import setpoint_shape
 
-    artefact = prepared.artefact
-    visited = sorted({artefact.setpoint_index(name) for name in prepared.course.visited})
-    return tuple(
-        GoalConfig(
-            index,
-            tuple(
-                map(
-                    tuple,
-                    setpoint_shape(
-                        artefact.setpoints[index], artefact.arm.length_m, GOAL_POINTS
-                    ).tolist(),
-                )
-            ),
-        )
-        for index in visited
-    )
+    length_m = artefact.arm.length_m
+    shapes = {i: setpoint_shape(artefact.setpoints[i], length_m, GOAL_POINTS) for i in indices}
+    return tuple(GoalConfig(i, tuple(map(tuple, one.tolist()))) for i, one in shapes.items())
 
 
 def _cores(nodes: int) -> list[int | None]:

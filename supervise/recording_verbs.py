@@ -15,7 +15,7 @@ from supervise.entry import show_json, teller
 from wire.errors import ExitCode
 
 Flag = tyro.conf.FlagCreatePairsOff[bool]
-From = Annotated[int | None, tyro.conf.arg(name="from")]
+From = Annotated[str | None, tyro.conf.arg(name="from")]
 
 
 def plot(
@@ -157,12 +157,14 @@ def replay(
     node: int | None = None,
     publish: Flag = False,
     first: From = None,
-    to: int | None = None,
+    to: str | None = None,
     deadline: float | None = None,
     rate: float | None = None,
     loop: Flag = False,
     at_once: Flag = False,
     listen: str | None = None,
+    live: Flag = False,
+    live_port: int | None = None,
     json: Flag = False,
     quiet: Flag = False,
 ) -> int:
@@ -172,14 +174,17 @@ def replay(
         recording: The recording, or the run's directory that holds it.
         node: Feed the recorded messages to the real process that has this node, over Zenoh.
         publish: Publish the telemetry over Zenoh again, for viewers, instead of comparing anything.
-        first: First tick that is compared or published; default: 0.
-        to: Last tick that is compared or published; default: the last one.
+        first: First tick that is compared or published, or an instant of the arm such as 12.5s; default: 0.
+        to: Last tick, or instant, that is compared or published; default: the last one.
         deadline: Longest wait for the process's answer in seconds, with --node; default: the run's.
         rate: Seconds of the arm's time in one of the clock, with --publish; default 1.
         loop: Begin again at the end, with --publish, until Ctrl-C.
         at_once: Begin without waiting for a subscriber, with --publish.
         listen: Zenoh endpoint for viewers, with --publish: tcp/ADDRESS:PORT or unixsock-stream/PATH; default:
             a free port of loopback.
+        live: Serve a page that shows the arm, as `octarm run --live` does, with --publish, and begin when it is
+            opened.
+        live_port: Port of 127.0.0.1 for the page, with --live; default: a free one.
         json: Print one JSON object instead of the lines.
         quiet: No progress.
     """
@@ -196,6 +201,8 @@ def replay(
         loop=loop,
         at_once=at_once,
         listen=listen,
+        live=live,
+        live_port=live_port,
     )
     done = run_replay(options, teller(silent=quiet or json))
     show_json(done.facts) if json else print(done.text)

@@ -2,7 +2,7 @@
 
 The recorder's way back: telemetry rows out of the file, batches on the same keys and in the same messages as in
 the run. The session is a router, as the plant's is: viewers are its clients. Nothing but telemetry is
-published; there is no node, no plant, no control.
+published, and the tokens by which viewers know that a node is there; there is no node, no plant, no control.
 """
 
 from __future__ import annotations
@@ -124,6 +124,7 @@ class Publisher:
         self._stopped = Event()
         self._said = 0.0
         self._publishers: dict[int, Any] = {}
+        self._tokens: list[Any] = []
         self._session: Any = None
 
     def __enter__(self) -> Publisher:
@@ -131,10 +132,14 @@ class Publisher:
         for sender in self._rows:
             key = self._keys.telemetry(sender)
             self._publishers[sender] = zsession.telemetry_publisher(self._session, key)
+        liveliness = self._session.liveliness()
+        for first in self._recording.configuration.firsts:
+            self._tokens.append(liveliness.declare_token(self._keys.ready(first)))
         return self
 
     def __exit__(self, *_: object) -> None:
         self._publishers.clear()
+        self._tokens.clear()
         self._session.close()
         remove_sockets([self.endpoint])
 

@@ -5,7 +5,10 @@ Between the verb, which only knows options and printing, and the three ways of a
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import math
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,22 +36,27 @@ class Options:
     recording: Path
     node: int | None = None
     publish: bool = False
-    first: int | None = None
-    last: int | None = None
+    first: str | None = None
+    """A tick, or an instant of the arm with an s behind: "431", "43.1s"."""
+    last: str | None = None
     deadline_s: float | None = None
     rate: float | None = None
     loop: bool = False
     at_once: bool = False
     listen: str | None = None
+    live: bool = False
+    live_port: int | None = None
 
     def __post_init__(self) -> None:
         if self.publish and self.node is not None:
             raise UsageError("--node and --publish: give one of them")
-        for name in ("rate", "loop", "at_once", "listen"):
+        for name in ("rate", "loop", "at_once", "listen", "live"):
             if not self.publish and getattr(self, name) not in (None, False):
                 raise UsageError(
                     f"--{name.replace('_', '-')} is for --publish; add it or leave it out"
                 )
+        if self.live_port is not None and not self.live:
+            raise UsageError("--live-port is for --live; add it or leave it out")
         if self.deadline_s is not None:
             if self.node is None:
                 raise UsageError("--deadline is for --node; add it or leave it out")
@@ -57,10 +65,31 @@ class Options:
                     f"--deadline {self.deadline_s:g}: expected a positive number of seconds"
                 )
 
-    @property
-    def span(self) -> Span:
-        """The ticks that are asked for."""
-        return Span(self.first or 0, self.last)
+    def span(self, tick_s: float) -> Span:
+        """The ticks that are asked for; of instants those from the first to the last that they enclose."""
+        first = _tick("--from", self.first, tick_s, math.ceil)
+        return Span(first or 0, _tick("--to", self.last, tick_s, math.floor))
+
+
+_ROUNDING = 1e-6
+"""Of a tick: 0.3 s are three ticks of 0.1 s."""
+
+
+def _tick(
+    option: str, text: str | None, tick_s: float, whole: Callable[[float], int]
+) -> int | None:
+    """The tick that an option means; UsageError if it means none."""
+    if text is None:
+        return None
+    try:
+        if not text.endswith("s"):
+            return int(text)
+        ticks = float(text.removesuffix("s")) / tick_s
+        return whole(ticks - _ROUNDING if whole is math.ceil else ticks + _ROUNDING)
+    except (ValueError, OverflowError):
+        raise UsageError(
+            f"{option} {text}: expected a tick such as 431, or seconds of the arm's time such as 43.1s"
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -78,7 +107,7 @@ def run_replay(options: Options, tell: Tell) -> Done:
         return _publish(options, tell)
     began = monotonic()
     recording = read_recording(find_recording(options.recording))
-    story = story_of(recording, options.span)
+    story = story_of(recording, options.span(recording.tick_s))
     if options.node is None:
         comparison, extra = check(story), dict[str, Any]()
     else:
@@ -115,22 +144,41 @@ def _one_process(
 
 
 def _publish(options: Options, tell: Tell) -> Done:
+    from supervise.replay_live import LivePage, live_config
     from supervise.replay_publish import Publisher
 
     recording = read_recording(find_recording(options.recording))
+    rate = 1.0 if options.rate is None else options.rate
     publisher = Publisher(
         recording,
-        rate=1.0 if options.rate is None else options.rate,
-        span=options.span,
+        rate=rate,
+        span=options.span(recording.tick_s),
         loop=options.loop,
         wait=not options.at_once,
         listen=options.listen,
         progress=tell,
     )
-    with publisher:
+    trouble: list[str] = []
+
+    def gone(how: str) -> None:
+        trouble.append(how)
+        publisher.stop()
+
+    with publisher, contextlib.ExitStack() as stack:
         tell(f"publishing {recording.path} on {publisher.endpoint}")
+        if options.live:
+            config = live_config(
+                recording,
+                options.span(recording.tick_s),
+                rate,
+                options.live_port,
+                publisher.endpoint,
+            )
+            page = stack.enter_context(LivePage(config, gone))
+            # without it nobody can look, so also with --quiet and --json
+            print(f"live at {page.url}", file=sys.stderr, flush=True)
         done = publisher.publish()
-    rate = done.rate(recording.tick_s)
+    held_rate = done.rate(recording.tick_s)
     facts = {
         "recording": str(recording.path),
         "run_id": recording.configuration.run_id,
@@ -138,11 +186,14 @@ def _publish(options: Options, tell: Tell) -> Done:
         "ticks_published": done.ticks,
         "rows_published": done.rows,
         "seconds": done.seconds,
-        "rate": rate,
+        "rate": held_rate,
+        "trouble": trouble[0] if trouble else None,
     }
-    held = "" if rate is None else f", {rate:.3g} x real time"
+    held = "" if held_rate is None else f", {held_rate:.3g} x real time"
     text = f"{done.ticks} ticks, {done.rows} rows published in {done.seconds:.1f} s{held}"
-    return Done(facts, text, ExitCode.OK)
+    if trouble:
+        text += f"; stopped: {trouble[0]}"
+    return Done(facts, text, ExitCode.DEGRADED if trouble else ExitCode.OK)
 
 
 def _facts(story: Story, comparison: Comparison, seconds: float) -> dict[str, Any]:

@@ -21,7 +21,12 @@ METRES, CURVATURES = 0.51e-5, 0.51e-4
 """What a frame may have lost by rounding."""
 
 
-def live_config(recording: Recording, elsewhere: tuple[int, ...] = (), port: int = 0) -> LiveConfig:
+def live_config(
+    recording: Recording,
+    elsewhere: tuple[int, ...] = (),
+    port: int = 0,
+    replay_from: int | None = None,
+) -> LiveConfig:
     """What the live process of this run would have got."""
     nodes = recording.deployment.nodes
     return LiveConfig(
@@ -32,6 +37,8 @@ def live_config(recording: Recording, elsewhere: tuple[int, ...] = (), port: int
         tip=TipConfig(recording.references.nodes[-1].to_plain(), nodes[-1].bend_m),
         goals=(GoalConfig(0, ((0.0, 0.0), (1.0, 0.0))),),
         elsewhere=elsewhere,
+        period_s=recording.tick_s,
+        replay_from=replay_from,
         links=LinkConfig((), (), None, deadline_s=5.0, epoch_ns=0, cpu=None, fifo=None),
     )
 

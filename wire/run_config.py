@@ -312,9 +312,15 @@ class LiveConfig:
     goals: tuple[GoalConfig, ...]
     elsewhere: tuple[int, ...]
     """Segments on machines with clocks of their own: what they measure cannot be compared."""
+    period_s: float
+    """Between two ticks as they come, wall clock: rows that are older are not on time. 0: nobody knows."""
+    replay_from: int | None
+    """None beside a run; else a recording is published again from this tick on, perhaps several times."""
     links: LinkConfig
 
     def __post_init__(self) -> None:
+        if not (math.isfinite(self.period_s) and self.period_s >= 0.0):
+            raise UsageError(f"period_s: expected 0 or more seconds, got {self.period_s!r}")
         if not 0 <= self.port <= 65_535:
             raise UsageError(f"port: expected 0..65535, got {self.port}")
 

@@ -23,6 +23,10 @@ export class ArmView {
     box[3] = Math.max(box[3], y);
   }
 
+  forget() {
+    this.trail = [];
+  }
+
   take(frame) {
     const shape = frame.shape;
     for (let i = 0; i < shape.length; i += 2) this.include(shape[i], shape[i + 1]);

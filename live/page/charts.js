@@ -15,6 +15,10 @@ export class ErrorChart {
     this.count = 0;
   }
 
+  forget() {
+    this.points = [];
+  }
+
   take(frame) {
     this.count += 1;
     if (this.count % this.stride) return;

@@ -37,7 +37,7 @@ class Page {
     this.gap = 100;
     this.timer = 0;
     const pace = facts.period_s === null ? "lock-step" : `real time, a tick every ${number(facts.period_s)} s`;
-    put("run", `${facts.run_id} \u00b7 ${facts.scenario} \u00b7 ${facts.nodes} nodes \u00b7 tick ${number(facts.tick_s)} s \u00b7 ${pace} \u00b7 gains ${facts.gains_sha256.slice(0, 12)}`);
+    put("run", `${facts.replay ? "replay of " : ""}${facts.run_id} \u00b7 ${facts.scenario} \u00b7 ${facts.nodes} nodes \u00b7 tick ${number(facts.tick_s)} s \u00b7 ${pace} \u00b7 gains ${facts.gains_sha256.slice(0, 12)}`);
     put("ticks", `of ${facts.ticks}`);
     put("due", facts.period_s === null ? "lock-step" : `${number(1 / facts.period_s)} due`);
     this.drawAll();
@@ -48,7 +48,12 @@ class Page {
     const again = this.frame !== null && frame.tick === this.frame.tick;
     if (!again) {
       if (this.frame !== null) this.gap = 0.7 * this.gap + 0.3 * Math.min(2000, now - this.cameAt);
-      this.before = this.frame;
+      const restarted = this.frame !== null && frame.tick < this.frame.tick; // a recording that is played in a loop
+      if (restarted) {
+        this.arm.forget();
+        this.errors.forget();
+      }
+      this.before = restarted ? null : this.frame;
       this.cameAt = now;
       this.arm.take(frame);
       this.errors.take(frame);

@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 from simulated_run import Scenario, write_recording
 
-from analysis.link_latency import (
+from analysis.link_times import link_facts, percentiles_ms
+from analysis.recording import Recording, read_recording
+from wire.link_latency import (
     CLOCKS,
     IN_MEMORY,
     MESSAGES,
     link_kinds,
     link_latencies,
-    percentiles_ms,
 )
-from analysis.link_times import link_facts
-from analysis.recording import Recording, read_recording
 
 
 def test_a_hop_begins_when_the_sender_has_all_that_it_needs() -> None:

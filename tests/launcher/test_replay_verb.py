@@ -316,3 +316,25 @@ def test_a_run_is_checked_much_faster_than_real_time(replay: Replay, recorded: P
     faster = facts["times_real_time"]
     assert isinstance(faster, float)
     assert np.isfinite(faster) and faster > 20.0
+
+
+@pytest.mark.parametrize(
+    ("given", "ticks"),
+    [(("0.3s", "0.75s"), (3, 7)), (("0.31s", "0.7s"), (4, 7)), (("3", "0.9s"), (3, 9))],
+)
+def test_instants_of_the_arm_stand_for_ticks(
+    replay: Replay, recorded: Path, given: tuple[str, str], ticks: tuple[int, int]
+) -> None:
+    """Ticks of 0.1 s: the first at or after an instant, the last at or before one."""
+    facts = replay(recorded, "--from", given[0], "--to", given[1])
+    assert (facts["from"], facts["to"]) == ticks
+
+
+@pytest.mark.parametrize("text", ["x", "1.5", "infs", "nans", "s", "-1s"])
+def test_what_is_no_instant_is_refused(
+    recorded: Path, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert octarm("replay", recorded, "--from", text) == 2
+    assert (
+        f"--from {text.removesuffix('s') if text == '-1s' else text}"[:8] in capsys.readouterr().err
+    )

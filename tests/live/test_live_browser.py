@@ -137,6 +137,27 @@ def test_the_page_shows_the_running_arm_and_how_it_ends(
     page.close()
 
 
+def test_a_recording_goes_round_on_the_page(start: Start, browser: Any) -> None:
+    run = start.run("--nodes", str(NODES), "--ticks", "100", "--no-plot", "--quiet")
+    assert run.finish() == 0, run.err
+    looping = ("--rate", "5", "--loop", "--publish", "--live", "--quiet")
+    cli = start("replay", run.recording(), *looping)
+    visit = Visit(browser, url_of(cli))
+    visit.wait_for_tick(90)
+    visit.page.wait_for_function(
+        "() => Number(document.getElementById('tick').textContent) < 60", timeout=PATIENCE_MS
+    )
+    visit.wait_for_tick(70)
+    assert visit.page.inner_text("#run").startswith("replay of ")
+    expect(visit.page.locator("#state")).to_have_text("running")
+    assert visit.cells("alive") == ["good"] * NODES
+    cli.popen.send_signal(signal.SIGINT)
+    assert cli.finish() == 130
+    expect(visit.page.locator("#state")).to_have_text("interrupted")
+    assert visit.complaints == []
+    visit.page.close()
+
+
 def test_a_lost_connection_is_said_and_greys_the_page(start: Start, browser: Any) -> None:
     cli = start.run(*RUN, "1000000")
     visit = Visit(browser, url_of(cli))

@@ -1,7 +1,7 @@
 """How long each link between neighbours takes, from the instants that the nodes note.
 
-A pure function on arrays: `octarm info` gives it those of a recording (/node/NN/timing), a live view may give
-it the last few ticks.
+A pure function on arrays: `octarm info` gives it those of a recording (/node/NN/timing), the live page those of
+the last ticks.
 
 The latency of a link is the time from the instant when the sender had all that its sum needs (its measurement,
 and the sum of the neighbour before it) to the instant when the receiver had the sum: the sender's arithmetic,
@@ -21,12 +21,11 @@ Array = npt.NDArray[np.float64]
 MESSAGES = "messages"
 IN_MEMORY = "in memory"
 CLOCKS = "clocks"
-SHARES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 
 
 @dataclass(frozen=True, eq=False)
 class LinkLatencies:
-    """Nanoseconds; NaN where an instant is missing (a late tick, a lost row)."""
+    """Nanoseconds; not finite where an instant is missing (a late tick, a lost row)."""
 
     forward_ns: Array
     """(K, n - 1), column i: from node i to node i + 1."""
@@ -66,13 +65,3 @@ def link_kinds(nodes: int, firsts: Sequence[int], own_clocks: frozenset[int]) ->
         else:
             kinds.append(MESSAGES)
     return kinds
-
-
-def percentiles_ms(durations_ns: Array) -> dict[str, float] | None:
-    """The percentiles of `SHARES` in ms, NaN left out; None if nothing is left."""
-    values = durations_ns[np.isfinite(durations_ns)]
-    if values.size == 0:
-        return None
-    return dict(
-        zip(SHARES, (1e-6 * np.percentile(values, [*SHARES.values()])).tolist(), strict=True)
-    )
