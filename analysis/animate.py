@@ -98,6 +98,7 @@ def animate(
     return {
         "animation": str(out),
         "recording": str(path),
+        "recording_complete": recording.unfinished is None,
         "frames": len(ticks),
         "fps": film.fps,
         "speed": speed,
@@ -109,9 +110,10 @@ def animate(
 
 def film_line(facts: dict[str, Any]) -> str:
     """The facts of `animate` as one line."""
+    cut = "" if facts["recording_complete"] else ", recording unfinished"
     return (
         f"{facts['animation']}: {facts['frames']} frames of {facts['width_px']} x "
-        f"{facts['height_px']}, {facts['speed']:g} x real time, {facts['bytes'] / 1e6:.2f} MB"
+        f"{facts['height_px']}, {facts['speed']:g} x real time{cut}, {facts['bytes'] / 1e6:.2f} MB"
     )
 
 

@@ -273,12 +273,15 @@ def _missing(story: Story, feeds: Sequence[Feed], replays: Sequence[Replayed]) -
     if cut is not None and (story.span.last is None or any(feed.stops <= last for feed in feeds)):
         reached = max((feed.ticks[-1] for feed in feeds if feed.ticks), default=-1)
         yield f"the file {cut}; nothing is there after tick {reached}"
+    same: dict[str, list[str]] = {}
     for feed, replayed in zip(feeds, replays, strict=True):
         if replayed.ended is not None:
             yield replayed.ended
         elif (why := _unknown(story, feed, last)) is not None:
             upto = f"replayed up to tick {feed.ticks[-1]}" if feed.ticks else "not replayed"
-            yield f"{name_of(feed.config)}: {upto}; {why}"
+            same.setdefault(f"{upto}; {why}", []).append(name_of(feed.config))
+    for text, (first, *more) in same.items():
+        yield f"{first}{f' and {len(more)} more' if more else ''}: {text}"
     fed = {feed.config.index for feed in feeds}
     for config in story.nodes.configs:  # whose rows have the sums that these gave
         near = {config.index - 1, config.last + 1} & {i for f in feeds for i in f.segments}

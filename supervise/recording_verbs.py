@@ -80,7 +80,7 @@ def animate(
     progress = teller(silent=quiet or json)
     facts = make_film(recording, out, Film(fps, speed, width), progress, force=force)
     show_json(facts) if json else print(film_line(facts))
-    return int(ExitCode.OK)
+    return int(ExitCode.OK if facts["recording_complete"] else ExitCode.DEGRADED)
 
 
 def diff(

@@ -258,3 +258,12 @@ def test_a_recording_without_an_arm_to_draw_is_refused(
     assert octarm(tmp_path / "no.mcap", "--out", tmp_path / "arm.gif") == 2
     assert "no.mcap" in capsys.readouterr().err
     assert not (tmp_path / "arm.gif").exists()
+
+
+def test_a_recording_that_was_cut_short_is_shown_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_recording(tmp_path / "recording.mcap", Scenario(nodes=2, ticks=20), close=False)
+    assert in_process.octarm("animate", tmp_path, "--quiet") == 3
+    assert "recording unfinished" in capsys.readouterr().out
+    assert (tmp_path / "arm.gif").exists()

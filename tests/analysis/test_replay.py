@@ -285,6 +285,9 @@ def test_rows_that_nobody_got_at_the_end_are_missed_by_the_counters(tmp_path: Pa
     counters.pop("node/00")
     found = check(story_of(dataclasses.replace(recording, counters=counters)))
     assert found.missing[0].startswith("node 0: replayed up to tick 19; it sent no last word")
+    found = check(story_of(dataclasses.replace(recording, counters=None)))
+    (both,) = found.missing  # the same of every node is said once
+    assert both.startswith("node 0 and 1 more: replayed up to tick 19; it sent no last word")
 
 
 def test_lost_rows_of_the_plant_are_not_needed(tmp_path: Path) -> None:
