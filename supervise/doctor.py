@@ -6,8 +6,10 @@ do.
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import platform
+import shutil
 import socket
 import sys
 import tempfile
@@ -55,6 +57,7 @@ def examine() -> list[Check]:
         ("unix sockets", _unix, "set TMPDIR to a short, writable directory or use --transport tcp"),
         ("loopback ports", _ports, "use --transport unix, or check the loopback interface"),
         ("gains", _gains, "make gains with `octarm design`"),
+        ("extras", _extras, "nothing needs them"),
         ("exchange", _exchange, "see the message; Zenoh could not link two sessions"),
     ]
     for name, step, remedy in steps:
@@ -120,6 +123,15 @@ def _gains() -> Check:
 
 def _short(path: Path) -> str:
     return os.path.relpath(path)
+
+
+def _extras() -> Check:
+    """What some verbs can use and nothing needs."""
+    films = "MP4 films" if shutil.which("ffmpeg") else "no MP4 films (ffmpeg is not here)"
+    tables = (
+        "Parquet" if importlib.util.find_spec("pyarrow") else "no Parquet (pyarrow is not here)"
+    )
+    return Check("extras", ok=True, found=f"{films}, {tables}")
 
 
 def _exchange() -> Check:

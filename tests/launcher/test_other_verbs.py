@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import shutil
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -67,6 +68,7 @@ def test_doctor_exchanges_messages_over_zenoh(start: Start) -> None:
     cli.finish()
     checks = {check["name"]: check for check in cli.json()["checks"]}
     assert {"python", "packages", "unix sockets", "loopback ports", "exchange"} <= checks.keys()
+    assert ("no MP4 films" in checks["extras"]["found"]) == (shutil.which("ffmpeg") is None)
     for name in ("python", "packages", "unix sockets", "loopback ports", "exchange"):
         assert checks[name]["ok"], checks[name]
     assert cli.json()["ok"] == all(check["ok"] for check in checks.values())
