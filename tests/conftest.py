@@ -23,6 +23,9 @@ from closed_form import write_gains
 ROOT = Path(__file__).resolve().parents[1]
 MARK = "OCTARM_TEST_RUN"
 PATIENCE_S = 60.0
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # Started in the background of a shell: what the tests start would not hear Ctrl-C either.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class Cli:
