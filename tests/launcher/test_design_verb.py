@@ -19,7 +19,7 @@ from stand_in_gains import Immediate, arm, arm_text, well
 
 import launcher
 from design.gain import Options
-from supervise import designing
+from supervise import design_verbs, designing
 from supervise.designing import Request, run_design
 from wire.artefact import GainsArtefact, digest, read_artefact
 from wire.errors import GainsRefusedError, UsageError
@@ -206,7 +206,7 @@ def test_every_choice_reaches_the_design(
 def test_the_command_line_has_the_defaults_of_the_room() -> None:
     defaults = {
         name: parameter.default
-        for name, parameter in inspect.signature(launcher.design).parameters.items()
+        for name, parameter in inspect.signature(design_verbs.design).parameters.items()
     }
     assert Options(defaults["solver"], defaults["time_limit"]) == Options()
     request = Request(Path("a"), Path("b"))

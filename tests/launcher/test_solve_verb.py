@@ -27,10 +27,10 @@ from stand_in_engine import (
     well,
 )
 
-import launcher
 from design.pde.problem_file import Task
 from design.solve_command import Choices, Request, facts, finite, prepare
 from design.solve_suite import Row, read_suite
+from supervise import design_verbs
 from supervise.engine import EngineDiedError
 from supervise.shipped import EXAMPLES, SUITE
 from supervise.solving import Answer, peak_memory_mb, solve_in_child
@@ -128,7 +128,7 @@ def test_every_choice_reaches_the_engine(
 
     monkeypatch.setattr("supervise.solving.solve_in_child", solve)
     dump = tmp_path / "programs"
-    code = launcher.solve(
+    code = design_verbs.solve(
         Path(N1), task="stability", bisect=("lam", -1.0, 9.0), degree=3, time_limit=7.0, solver="SCS",
         dump_problem=dump,
     )  # fmt: skip
@@ -141,17 +141,17 @@ def test_every_choice_reaches_the_engine(
     shown = capsys.readouterr()
     assert shown.err == "degree 1\n"
     assert "9.5" in shown.out
-    launcher.solve(Path(N1), settings=("lam=2.5",), quiet=True)
+    design_verbs.solve(Path(N1), settings=("lam=2.5",), quiet=True)
     assert asked[1].problem.pde.parameters == {"lam": 2.5}
     assert asked[1].task is Task.OBSERVER
     assert capsys.readouterr().err == ""
 
 
 def test_the_command_line_has_the_engines_defaults_and_tasks() -> None:
-    hints = get_type_hints(launcher.solve)
+    hints = get_type_hints(design_verbs.solve)
     literal = next(part for part in get_args(hints["task"]) if part is not type(None))
     assert set(get_args(literal)) == {task.value for task in Task}
-    parameters = inspect.signature(launcher.solve).parameters
+    parameters = inspect.signature(design_verbs.solve).parameters
     defaults = {name: parameter.default for name, parameter in parameters.items()}
     assert Choices() == Choices(
         defaults["task"], defaults["bisect"], defaults["settings"], defaults["degree"],
@@ -483,12 +483,12 @@ def test_the_suite_on_the_command_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("supervise.solving.solve_in_child", prepared(truth()))
-    assert launcher.solve(suite=True) == 0
+    assert design_verbs.solve(suite=True) == 0
     shown = capsys.readouterr()
     assert "17 of 17 rows ok" in shown.out
     assert "S1: degree 1 of S1" in shown.err
     monkeypatch.setattr("supervise.solving.solve_in_child", prepared(truth() | {"O1": 0.6}))
-    assert launcher.solve(suite=True, only=("O1", "O2"), json=True) == 6
+    assert design_verbs.solve(suite=True, only=("O1", "O2"), json=True) == 6
     shown = capsys.readouterr()
     found = strict(shown.out)
     assert [(row["id"], row["ok"]) for row in found["rows"]] == [("O1", False), ("O2", True)]

@@ -15,7 +15,7 @@ from unittest import mock
 import in_process
 import pytest
 
-import launcher
+from supervise import design_verbs
 from supervise.studying import STUDIES, keywords_of
 from wire.artefact import GainsArtefact
 from wire.errors import UsageError
@@ -155,4 +155,4 @@ def test_jobs_are_counted_from_one() -> None:
 
 
 def test_the_verb_offers_what_there_is() -> None:
-    assert get_args(get_type_hints(launcher.study)["name"]) == STUDIES
+    assert get_args(get_type_hints(design_verbs.study)["name"]) == STUDIES
