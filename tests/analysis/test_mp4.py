@@ -236,8 +236,12 @@ def test_nothing_is_left_of_a_film_whose_picture_failed(path: Path, tmp_path: Pa
 
 @needs_ffmpeg
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_ffmpeg_ends_with_the_verb(path: Path, tmp_path: Path, end: signal.Signals) -> None:
+def test_ffmpeg_ends_with_the_verb(
+    tmp_path_factory: pytest.TempPathFactory, tmp_path: Path, end: signal.Signals
+) -> None:
     """However the verb ends; only a SIGKILL leaves what was written so far."""
+    path = tmp_path_factory.mktemp("long") / "recording.mcap"
+    write_recording(path, Scenario(nodes=4, ticks=600))  # a film that takes many seconds
     command = [sys.executable, str(ROOT / "launcher.py"), "animate", str(path)]
     command += [
         "--out",
