@@ -7,11 +7,11 @@ are not the same. One of versions or machine does not; it is shown because it ma
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from analysis.facts import fact
 from analysis.recording import Recording
 
 OWN = ("run_id", "artefact_path", "segments_per_process", "pace")
@@ -67,7 +67,7 @@ def about_differences(one: Recording, other: Recording) -> list[FactDifference]:
     for name in {**one.facts, **other.facts}:
         if name in _NOT_ABOUT:
             continue
-        a, b = (_parsed(r.facts.get(name)) for r in (one, other))
+        a, b = (fact(r.facts.get(name)) for r in (one, other))
         out += [FactDifference(key, x, y, counts=False) for key, x, y in _different(name, a, b)]
     return out
 
@@ -81,15 +81,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(inner) for inner in value]
     return value
-
-
-def _parsed(text: str | None) -> Any:
-    if text is None or text[:1] not in ("{", "["):
-        return text
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
 
 
 def _floats(value: Any) -> Iterator[float]:

@@ -169,7 +169,7 @@ def _about(recording: Recording, end: int) -> dict[str, Any]:
         "last_tick": end,
         "artefact_sha256": recording.configuration.artefact_sha256,
         "ended": recording.ending(),
-        "complete": recording.unfinished is None and recording.counters is not None,
+        "complete": recording.complete,
         "stops": recording.unfinished,
     }
 

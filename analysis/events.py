@@ -1,6 +1,6 @@
 """The run's story as typed rows, whatever the format version: from the table of /event to those who tell it.
 
-Up to now levels are words; foxglove.Log, which newer recordings use, counts them and adds fields of its own.
+In version 3 levels are words; since then they are foxglove.Log's numbers.
 """
 
 from __future__ import annotations
@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from analysis.table import Table
+from wire.foxglove import LEVEL_NAMES
 
-LEVELS = ("unknown", "debug", "info", "warning", "error", "fatal")
-"""In the order of foxglove.Log's numbers."""
 FIELDS = ("level", "name", "message")
 
 
@@ -21,7 +20,7 @@ class Event:
     tick: int
     time_s: float
     level: str
-    """One of `LEVELS`."""
+    """One of wire.foxglove.LEVEL_NAMES."""
     name: str
     message: str
 
@@ -35,12 +34,13 @@ def read_events(table: Table | None) -> list[Event]:
         return []
     columns = [table.column(name).tolist() for name in ("tick", "time_s", *FIELDS)]
     return [
-        Event(int(tick), float(time_s), _word(level), str(name), str(message))
+        Event(int(tick), float(time_s), level_name(level), str(name), str(message))
         for tick, time_s, level, name, message in zip(*columns, strict=True)
     ]
 
 
-def _word(level: object) -> str:
-    if isinstance(level, int) and 0 <= level < len(LEVELS):
-        return LEVELS[level]
+def level_name(level: object) -> str:
+    """The word for a level, which may be one already."""
+    if isinstance(level, int) and 0 <= level < len(LEVEL_NAMES):
+        return LEVEL_NAMES[level]
     return str(level)

@@ -85,7 +85,7 @@ def export(
         )
     return {
         "recording": str(path),
-        "complete": recording.unfinished is None and recording.counters is not None,
+        "complete": recording.complete,
         "stops": recording.unfinished,
         "nodes": recording.nodes,
         "ticks": exported.ticks,

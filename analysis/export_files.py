@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 
 from analysis.export_tables import DICTIONARY, ColumnInfo, Exported
+from analysis.facts import fact
 from analysis.table import Column
 from wire.channels import SUMMARY
 from wire.errors import UsageError
@@ -34,30 +35,20 @@ def run_facts(exported: Exported) -> dict[str, Any]:
         "format": FORMAT,
         "version": VERSION,
         "recording": recording.path.name,
-        "complete": recording.unfinished is None and recording.counters is not None,
+        "complete": recording.complete,
         "stops": recording.unfinished,
         "nodes": recording.nodes,
         "ticks": exported.ticks,
         "tick_s": recording.tick_s,
         "configuration": msgspec.json.decode(recording.facts["run"]),
         "arm": msgspec.to_builtins(recording.artefact.arm),
-        "metadata": {k: _parsed(v) for k, v in recording.facts.items() if k != "run"},
-        SUMMARY: {k: _parsed(v) for k, v in (recording.counters or {}).items()},
+        "metadata": {k: fact(v) for k, v in recording.facts.items() if k != "run"},
+        SUMMARY: {k: fact(v) for k, v in (recording.counters or {}).items()},
         "tables": {
             name: [dataclasses.asdict(column) for column in columns]
             for name, columns in DICTIONARY.items()
         },
     }
-
-
-def _parsed(text: str) -> Any:
-    """A value of the metadata: JSON is taken apart, but a name that looks like a number stays one."""
-    if text[:1] not in ("{", "["):
-        return text
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
 
 
 def run_text(exported: Exported) -> str:

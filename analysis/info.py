@@ -7,7 +7,6 @@ holds, whole or cut short. Of the payloads only timing, pace and events are deco
 from __future__ import annotations
 
 import dataclasses
-import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -16,6 +15,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from analysis.events import level_name
+from analysis.facts import fact
 from analysis.info_flow import message_kinds, process_rows
 from analysis.link_times import link_facts, percentiles_ms
 from analysis.recording import ENDINGS
@@ -23,12 +24,10 @@ from analysis.survey import RECOVERED, Survey, configuration_of, survey, ticks_o
 from analysis.table import Table, decode_table
 from wire.channels import METADATA, PACE, SUMMARY, SWEEP_TIMING
 from wire.errors import UsageError
+from wire.foxglove import EVENTS
 from wire.link_latency import Array
 from wire.run_config import RunConfig
 
-EVENTS = "/event"
-LEVELS = {1: "debug", 2: "info", 3: "warning", 4: "error", 5: "fatal"}
-"""Of an event, where it is a number."""
 _NUMBERS = re.compile(r"/\d+(?=/|$)")
 
 
@@ -44,7 +43,9 @@ def info(path: Path) -> dict[str, Any]:
     tables = {
         topic: table
         for topic, count in found.channels.items()
-        if count.payloads and topic != EVENTS and (table := _table(topic, count.payloads, notes))
+        if count.payloads
+        and topic != EVENTS.topic
+        and (table := _table(topic, count.payloads, notes))
     }
     counters = found.metadata.get(SUMMARY)
     ticks = None if run is None else ticks_of(found, run)
@@ -106,7 +107,7 @@ def channel_groups(channels: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]
 
 
 def _wanted(topic: str) -> bool:
-    return topic in (EVENTS, "/plant/pace") or topic.endswith("/timing")
+    return topic in (EVENTS.topic, "/plant/pace") or topic.endswith("/timing")
 
 
 def _table(topic: str, payloads: list[bytes], notes: list[str]) -> Table | None:
@@ -159,18 +160,8 @@ def _run(found: Survey, run: RunConfig | None) -> dict[str, Any]:
         "git_revision": facts.get("git_revision"),
     }
     for name in ("versions", "machine", "hosts"):
-        out[name] = _value(facts.get(name))
+        out[name] = fact(facts.get(name))
     return out
-
-
-def _value(text: str | None) -> Any:
-    """JSON as its value, other text as it is."""
-    if text is None or text[:1] not in ("{", "["):
-        return text
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        return text
 
 
 def _duration(run: RunConfig | None, ticks: int | None, sweep: Table | None) -> dict[str, Any]:
@@ -257,7 +248,7 @@ def _losses(counters: Mapping[str, str] | None, pace: Table | None) -> dict[str,
 
 
 def _events(found: Survey, run: RunConfig | None, notes: list[str]) -> list[dict[str, Any]]:
-    count = found.channels.get(EVENTS)
+    count = found.channels.get(EVENTS.topic)
     out = []
     for payload in (count and count.payloads) or []:
         try:
@@ -271,7 +262,7 @@ def _events(found: Survey, run: RunConfig | None, notes: list[str]) -> list[dict
             {
                 "tick": tick,
                 "time_s": tick * run.tick_s if run and isinstance(tick, int) else None,
-                "level": LEVELS.get(level, str(level)) if isinstance(level, int) else level,
+                "level": level_name(level) if isinstance(level, int) else level,
                 "name": event.get("name"),
                 "message": event.get("message"),
             }

@@ -11,6 +11,7 @@ import dataclasses
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from io import BytesIO
 from typing import Any
 
@@ -94,14 +95,10 @@ class Walk:
     doubts: list[str] = field(default_factory=list)
     """What is wrong with a file that is all there: checksums of its data section and its index."""
     _schemas: dict[int, Schema] = field(default_factory=dict)
-    _repeated: tuple[dict[int, Schema], dict[int, Channel]] = field(
-        default_factory=lambda: ({}, {})
-    )
     _waiting: Damage | None = None
     """A damaged chunk: the indexes that follow it say how many messages were in it."""
 
     def __iter__(self) -> Iterator[Piece | Damage]:
-        self._repeated = self._summary()
         offset, opcode, ended = len(MAGIC), 0, False
         while offset < len(self.data) and not ended:
             self.stopped_at = offset
@@ -321,8 +318,12 @@ class Walk:
             return None
         return start
 
-    def _summary(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
-        """Schemas and channels as the end of the file repeats them; empty if that cannot be used."""
+    @cached_property
+    def _repeated(self) -> tuple[dict[int, Schema], dict[int, Channel]]:
+        """Schemas and channels as the end of the file repeats them; empty if that cannot be used.
+
+        Only a damaged file asks for them.
+        """
         start = self._summary_start()
         if start is None:
             return {}, {}

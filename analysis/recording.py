@@ -82,6 +82,11 @@ class Recording:
     order: Sequence[str] = ()
     """The topic of every message, in the order of the file."""
 
+    @property
+    def complete(self) -> bool:
+        """Whether the file was closed properly and has the final counters."""
+        return self.unfinished is None and self.counters is not None
+
     def table(self, topic: str) -> Table:
         """The messages of a topic; UsageError if there is no such channel."""
         try:
@@ -367,15 +372,18 @@ def _artefact(content: McapContent, path: Path) -> GainsArtefact:
     )
 
 
+def needed_topics(nodes: int) -> list[str]:
+    """The channels that a tick must have reached to count as one of the recording."""
+    names = [label(i, nodes) for i in range(nodes)]
+    kinds = ("measurement", "estimate", "command")
+    own = [f"/node/{name}/{kind}" for name in names for kind in kinds]
+    return [*own, *(f"/plant/truth/{name}" for name in names)]
+
+
 def _common_ticks(tables: Mapping[str, Table], run: RunConfig) -> int:
     """Ticks from 0 on that the plant and every node have reached in this file."""
-    needed = []
-    for i in range(run.nodes):
-        name = label(i, run.nodes)
-        needed += [f"/node/{name}/{kind}" for kind in ("measurement", "estimate", "command")]
-        needed.append(f"/plant/truth/{name}")
     last = []
-    for topic in needed:
+    for topic in needed_topics(run.nodes):
         table = tables.get(topic)
         last.append(-1 if table is None or not table.rows else int(table.ticks.max()))
     return min(last) + 1

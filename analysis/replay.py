@@ -19,18 +19,14 @@ from node.block import NotFiniteError, SegmentBlock
 from node.configured import sweeps_of
 from node.row import Y
 from node.sweep import NodeSweep, payload
-from wire.channels import COMMAND, MEASUREMENT, STATE, label
+from wire.channels import SETPOINT_AT, SUMS_AT, label
 from wire.errors import UsageError
-from wire.joints import SUMS_AT
 from wire.messages import RejectedError
 from wire.run_config import NodeConfig
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
-SETPOINT_AT = len(MEASUREMENT) + len(STATE) + len(COMMAND)
-"""Where a node's row has the setpoint whose gains it uses."""
-COMMAND_AT = len(MEASUREMENT) + len(STATE)
 BATCH = 64
 
 

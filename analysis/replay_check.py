@@ -20,7 +20,6 @@ import numpy.typing as npt
 from analysis.recorded_nodes import RecordedNodes, recorded_nodes
 from analysis.recording import Recording
 from analysis.replay import (
-    COMMAND_AT,
     Feed,
     Replayed,
     Rows,
@@ -31,9 +30,8 @@ from analysis.replay import (
     topic,
 )
 from node.row import Y
-from wire.channels import COMMAND, MEASUREMENT, SCHEDULE, STATE, label
+from wire.channels import COMMAND, COMMAND_AT, MEASUREMENT, SCHEDULE, STATE, SUMS_AT, label
 from wire.errors import UsageError
-from wire.joints import SUMS_AT
 from wire.run_config import NodeConfig
 
 Array = npt.NDArray[np.float64]

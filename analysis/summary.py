@@ -119,7 +119,7 @@ def summary_of(recording: Recording) -> dict[str, Any]:
         "artefact_sha256": run.artefact_sha256,
         "ended": recording.ending(),
         "recording": str(recording.path),
-        "recording_complete": recording.unfinished is None and recording.counters is not None,
+        "recording_complete": recording.complete,
         "recording_stops": recording.unfinished,
     }
     return {key: _finite(value) for key, value in summary.items()}

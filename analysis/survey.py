@@ -16,8 +16,8 @@ from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 
 from analysis.mcap_records import read_bytes
 from analysis.mcap_walk import DATA_DOUBT, Damage, Piece, Walk
-from analysis.recording import check_version, not_ours
-from wire.channels import METADATA, label
+from analysis.recording import check_version, needed_topics, not_ours
+from wire.channels import METADATA
 from wire.errors import UsageError
 from wire.run_config import RunConfig, loads
 
@@ -243,10 +243,7 @@ def configuration_of(found: Survey, notes: list[str]) -> RunConfig | None:
 def ticks_of(found: Survey, run: RunConfig) -> int:
     """Ticks from 0 on that the plant and every node have reached in this file, by the log times."""
     last = []
-    for i in range(run.nodes):
-        name = label(i, run.nodes)
-        kinds = ("measurement", "estimate", "command")
-        for topic in (*(f"/node/{name}/{kind}" for kind in kinds), f"/plant/truth/{name}"):
-            count = found.channels.get(topic)
-            last.append(-1 if count is None else count.last_ns)
+    for topic in needed_topics(run.nodes):
+        count = found.channels.get(topic)
+        last.append(-1 if count is None else count.last_ns)
     return round(min(last) * 1e-9 / run.tick_s) + 1 if min(last) >= 0 else 0

@@ -13,23 +13,13 @@ import numpy.typing as npt
 
 from analysis.recording import Recording
 from analysis.table import Table
-from wire.channels import (
-    ANNOUNCED,
-    ARM_SO_FAR,
-    PACE,
-    SWEEP_TIMING,
-    Channel,
-    label,
-    node_channels,
-    plant_channels,
-)
+from wire.channels import ANNOUNCED, ARM_SO_FAR, LATE_AT, Channel, label
 from wire.messages import PLANT
+from wire.telemetry import telemetry_layout
 
 Array = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
-LATE_AT = -len(SWEEP_TIMING) - len(PACE)
-"""Where the plant's row says whether the tick had no sweep."""
 _NOTHING = Table("", {})
 
 
@@ -38,15 +28,11 @@ def telemetry_channels(recording: Recording) -> dict[int, list[Channel]]:
 
     How long a sum is stands in its messages; of one without a message nothing but its last numbers is known.
     """
-    n = recording.nodes
-    layout = {}
-    for i in range(n):
-        root = f"/node/{label(i, n)}"
-        forward = _numbers(recording, f"{root}/forward_sum", len(ARM_SO_FAR))
-        backward = _numbers(recording, f"{root}/backward_sum", len(ANNOUNCED))
-        layout[i] = node_channels(i, n, forward, backward)
-    layout[PLANT] = plant_channels(n)
-    return layout
+    roots = [f"/node/{label(i, recording.nodes)}" for i in range(recording.nodes)]
+    return telemetry_layout(
+        [_numbers(recording, f"{root}/forward_sum", len(ARM_SO_FAR)) for root in roots],
+        [_numbers(recording, f"{root}/backward_sum", len(ANNOUNCED)) for root in roots],
+    )
 
 
 def telemetry_rows(recording: Recording) -> dict[int, Array]:

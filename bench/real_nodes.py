@@ -15,8 +15,8 @@ from node.row import Y
 from supervise.endpoints import Endpoints
 from supervise.options import MOST_TICKS, RunOptions
 from supervise.plan import Prepared, make_plan, prepare
+from wire.channels import SUMS_AT
 from wire.factors import NodeFactors
-from wire.joints import SUMS_AT
 from wire.messages import message_bytes
 from wire.run_config import NodeConfig
 

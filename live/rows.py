@@ -12,8 +12,9 @@ from time import monotonic
 import numpy as np
 import numpy.typing as npt
 
-from wire.channels import Channel, node_channels, plant_channels, width
+from wire.channels import width
 from wire.messages import PLANT, Batch
+from wire.telemetry import telemetry_layout
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -41,10 +42,7 @@ class RecentRows:
     ) -> None:
         self.nodes = nodes
         self._again_from = again_from
-        self.layout: dict[int, list[Channel]] = {
-            i: node_channels(i, nodes, forward[i], backward[i]) for i in range(nodes)
-        }
-        self.layout[PLANT] = plant_channels(nodes)
+        self.layout = telemetry_layout(forward, backward)
         self.columns = {sender: width(channels) for sender, channels in self.layout.items()}
         """Numbers in the rows of each sender."""
         self._rows = {sender: np.zeros((KEPT, columns)) for sender, columns in self.columns.items()}

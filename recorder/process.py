@@ -20,19 +20,7 @@ from recorder.merge import Gap, Row, TickMerge
 from recorder.scene import SceneDrawer
 from recorder.writer import RecordingWriter
 from wire import session as zsession
-from wire.channels import (
-    COMMAND,
-    MEASUREMENT,
-    PACE,
-    STATE,
-    SWEEP_TIMING,
-    Channel,
-    columns_of,
-    label,
-    node_channels,
-    plant_channels,
-    width,
-)
+from wire.channels import LATE_AT, SETPOINT_AT, columns_of, label, width
 from wire.child import Child, Deadline
 from wire.counters import Flow, Rejections
 from wire.errors import ExitCode
@@ -48,6 +36,7 @@ from wire.messages import (
     run_tag,
 )
 from wire.run_config import RecorderConfig
+from wire.telemetry import telemetry_layout
 
 CAPACITY = 8192
 """Batches that may wait in memory for this process."""
@@ -55,10 +44,6 @@ POLL_S = 0.005
 PROGRESS_S = 0.1
 FINISH_S = 10.0
 """How long to wait for the last words of processes that are alive."""
-SETPOINT_AT = len(MEASUREMENT) + len(STATE) + len(COMMAND)
-"""Where a node's row has the setpoint whose gains it uses."""
-LATE_AT = -len(SWEEP_TIMING) - len(PACE)
-"""Where the plant's row says whether the tick had no sweep."""
 
 
 class RecorderProcess:
@@ -69,11 +54,7 @@ class RecorderProcess:
         self._child = child
         run = config.run
         self._run = run_tag(run.run_id)
-        layout: dict[int, list[Channel]] = {
-            i: node_channels(i, run.nodes, config.forward_widths[i], config.backward_widths[i])
-            for i in range(run.nodes)
-        }
-        layout[PLANT] = plant_channels(run.nodes)
+        layout = telemetry_layout(config.forward_widths, config.backward_widths)
         self._columns = {sender: width(channels) for sender, channels in layout.items()}
         self._merge = TickMerge(list(layout))
         self._writer = RecordingWriter(Path(config.path), run.tick_s, layout, config.flush_s)

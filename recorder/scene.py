@@ -35,5 +35,5 @@ class SceneDrawer:
             return None
         shape = plant[self._shape]
         points = list(zip(shape[::2], shape[1::2], strict=True))
-        (x, y) = plant[self._reference]
-        return scene_update(log_time_ns, points, self._joints.points(tick, rows), [(x, y)])
+        x, y = plant[self._reference]
+        return scene_update(log_time_ns, points, self._joints.points(tick, rows), (x, y))

@@ -145,7 +145,7 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
     nodes = options.nodes
     run = RunConfig(
         run_id=run_id,
-        scenario=course.scenario,
+        scenario=course.told.name,
         nodes=nodes,
         spacing=spacing_name(options.placed),
         faces_m=tuple(deployment.faces_m.tolist()),

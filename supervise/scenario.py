@@ -153,7 +153,6 @@ class Course:
 
     told: Scenario
     """As the file tells it, without the options."""
-    scenario: str
     setpoint: str
     initial: str
     control: bool
@@ -195,7 +194,6 @@ def settle(options: RunOptions) -> Course:
         cells = max(scenario.plant_cells, plant_cells(options.nodes, None))
     return Course(
         told=scenario,
-        scenario=scenario.name,
         setpoint=_given(options.setpoint, scenario.start),
         initial=_given(options.initial, scenario.initial),
         control=scenario.control,

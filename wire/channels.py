@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from wire.columns import channel_name, description, unit
 
@@ -55,6 +56,14 @@ SWEEP_TIMING = ("due_wall_ns", "started_wall_ns", "duration_wall_ns", "advance_w
 """When the tick should begin (in lock-step: when it did); its first measurement sent; from there to the last
 command received by the plant (0: not within this tick; a late tick has it of the sweep that ended in it); and
 the arm's own integration."""
+COMMAND_AT = len(MEASUREMENT) + len(STATE)
+"""Where a node's telemetry row has its command, after measurement and estimate;"""
+SETPOINT_AT = COMMAND_AT + len(COMMAND)
+"""the setpoint whose gains it uses;"""
+SUMS_AT = SETPOINT_AT + len(SCHEDULE)
+"""and the sums that it received."""
+LATE_AT = -len(SWEEP_TIMING) - len(PACE)
+"""Where the plant's row says whether the tick had no sweep."""
 EVENT = ("timestamp", "level", "name", "message", "file", "line")
 """Fields of foxglove.Log."""
 
@@ -75,20 +84,28 @@ class Channel:
     @property
     def schema(self) -> bytes:
         """JSON Schema of a message."""
-        channel = channel_name(self.topic)
-        properties: dict[str, dict[str, str]] = {}
-        for field in ("tick", "time_s", *self.fields):
-            properties[field] = {"type": "integer" if field == "tick" else "number"}
-            if text := unit(field):
-                properties[field]["unit"] = text
-            properties[field]["description"] = description(channel, field)
-        schema = {
-            "type": "object",
-            "title": self.schema_name,
-            "properties": properties,
-            "required": list(properties),
-        }
+        properties = {"tick": self._field("tick", "integer"), "time_s": self._field("time_s")}
+        schema = object_schema(self.schema_name, properties | self.field_schemas())
         return json.dumps(schema, separators=(",", ":")).encode()
+
+    def field_schemas(self) -> dict[str, Any]:
+        """JSON Schemas of the fields after `tick` and `time_s`."""
+        return {field: self._field(field) for field in self.fields}
+
+    def _field(self, name: str, kind: str = "number") -> dict[str, str]:
+        of_unit = {"unit": text} if (text := unit(name)) else {}
+        about = description(channel_name(self.topic), name)
+        return {"type": kind, **of_unit, "description": about}
+
+
+def object_schema(title: str, properties: dict[str, Any]) -> dict[str, Any]:
+    """JSON Schema of an object that has all these properties."""
+    return {
+        "type": "object",
+        "title": title,
+        "properties": properties,
+        "required": list(properties),
+    }
 
 
 def label(index: int, nodes: int) -> str:

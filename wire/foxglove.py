@@ -6,18 +6,19 @@ Every message also has `tick` and `time_s`, as all channels do, which viewers le
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
-from wire.channels import EVENT, Channel
+from wire.channels import EVENT, Channel, object_schema
 
 FRAME = "arm"
 """Coordinate frame of the scene: x along the straight arm, y to its side, the root at 0."""
 SCENE_PERIOD_S = 0.05
 """Scenes are recorded every so often of the arm's time, or every tick if that is longer."""
-LEVELS = {"info": 2, "warning": 3, "error": 4}
+LEVEL_NAMES = ("unknown", "debug", "info", "warning", "error", "fatal")
+"""In the order of foxglove.LogLevel's numbers."""
+LEVELS = {name: LEVEL_NAMES.index(name) for name in ("info", "warning", "error")}
 """foxglove.LogLevel of the names that events have inside octarm."""
 TRUE_ARM, ESTIMATED_ARM, REFERENCE_TIP = "true arm", "estimated arm", "reference of the tip"
 _DIGITS = 5
@@ -41,36 +42,21 @@ class StandardChannel(Channel):
     """A channel with a schema of Foxglove's name."""
 
     name: str = ""
-    properties: str = ""
-    """JSON of the fields' schemas."""
+    properties: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """JSON Schemas of the fields."""
 
     @property
     def schema_name(self) -> str:
         """The name that Foxglove knows."""
         return self.name
 
-    @property
-    def schema(self) -> bytes:
-        """JSON Schema of a message."""
-        fields = {
-            "tick": {"type": "integer"},
-            "time_s": {"type": "number"},
-            **json.loads(self.properties),
-        }
-        return json.dumps(_object(self.name, fields), separators=(",", ":")).encode()
-
-
-def _object(title: str, properties: Json) -> Json:
-    return {
-        "type": "object",
-        "title": title,
-        "properties": properties,
-        "required": list(properties),
-    }
+    def field_schemas(self) -> Json:
+        """As they were given."""
+        return dict(self.properties)
 
 
 def _numbers(title: str, names: str) -> Json:
-    return _object(title, {name: {"type": "number"} for name in names})
+    return object_schema(title, {name: {"type": "number"} for name in names})
 
 
 def _list(items: Json) -> Json:
@@ -78,17 +64,17 @@ def _list(items: Json) -> Json:
 
 
 def _instant(title: str) -> Json:
-    return _object(title, {"sec": {"type": "integer"}, "nsec": {"type": "integer"}})
+    return object_schema(title, {"sec": {"type": "integer"}, "nsec": {"type": "integer"}})
 
 
 def _scene_properties() -> Json:
     point, colour = _numbers("foxglove.Point3", "xyz"), _numbers("foxglove.Color", "rgba")
     vector = _numbers("foxglove.Vector3", "xyz")
-    pose = _object(
+    pose = object_schema(
         "foxglove.Pose",
         {"position": vector, "orientation": _numbers("foxglove.Quaternion", "xyzw")},
     )
-    line = _object(
+    line = object_schema(
         "foxglove.LinePrimitive",
         {
             "type": {"type": "integer", "description": "0: points joined one after the other"},
@@ -101,8 +87,10 @@ def _scene_properties() -> Json:
             "indices": _list({"type": "integer"}),
         },
     )
-    sphere = _object("foxglove.SpherePrimitive", {"pose": pose, "size": vector, "color": colour})
-    entity = _object(
+    sphere = object_schema(
+        "foxglove.SpherePrimitive", {"pose": pose, "size": vector, "color": colour}
+    )
+    entity = object_schema(
         "foxglove.SceneEntity",
         {
             "timestamp": _instant("time"),
@@ -127,9 +115,9 @@ _LOG: Json = {
     "file": {"type": "string"},
     "line": {"type": "integer"},
 }
-EVENTS = StandardChannel("/event", EVENT, "foxglove.Log", json.dumps(_LOG))
+EVENTS = StandardChannel("/event", EVENT, "foxglove.Log", _LOG)
 SCENE = StandardChannel(
-    "/scene", ("deletions", "entities"), "foxglove.SceneUpdate", json.dumps(_scene_properties())
+    "/scene", ("deletions", "entities"), "foxglove.SceneUpdate", _scene_properties()
 )
 
 
@@ -155,18 +143,20 @@ def scene_every(tick_s: float) -> int:
 
 
 def scene_update(
-    log_time_ns: int, true_arm: Points, estimated_arm: Points | None, reference_tip: Points
+    log_time_ns: int,
+    true_arm: Points,
+    estimated_arm: Points | None,
+    reference_tip: tuple[float, float],
 ) -> Json:
-    """The arm at one instant: points (x, y) in m from root to tip; the reference's tip is one point.
+    """The arm at one instant: points (x, y) in m, of the arms from root to tip.
 
     An estimated arm that is not known (None) leaves the last one where it was.
     """
     entities = [_line(TRUE_ARM, log_time_ns, true_arm, 0.012)]
     if estimated_arm is not None:
         entities.append(_line(ESTIMATED_ARM, log_time_ns, estimated_arm, 0.006))
-    ((x, y),) = reference_tip
     sphere = {
-        "pose": {"position": _point(x, y), "orientation": _POSE["orientation"]},
+        "pose": {"position": _point(*reference_tip), "orientation": _POSE["orientation"]},
         "size": {"x": 0.02, "y": 0.02, "z": 0.02},
         "color": _colour(REFERENCE_TIP),
     }

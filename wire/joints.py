@@ -13,11 +13,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from wire.channels import ARM_SO_FAR, COMMAND, MEASUREMENT, SCHEDULE, STATE
+from wire.channels import ARM_SO_FAR, COMMAND, MEASUREMENT, STATE, SUMS_AT
 from wire.reference import Reference
 
-SUMS_AT = len(MEASUREMENT) + len(STATE) + len(COMMAND) + len(SCHEDULE)
-"""Where the sums begin in a node's telemetry row."""
 _STRAIN_AT = len(MEASUREMENT) + STATE.index("strain")
 _CURVATURE_AT = len(MEASUREMENT) + STATE.index("curvature_per_m")
 _CHORD = len(STATE) + len(COMMAND)

@@ -20,6 +20,7 @@ from matplotlib.transforms import ScaledTranslation, blended_transform_factory
 
 from analysis.goals import active_setpoints, colour
 from analysis.recording import Recording
+from wire.foxglove import EVENTS
 
 Array = npt.NDArray[np.float64]
 
@@ -80,7 +81,7 @@ def runs_of(active: npt.NDArray[np.int64]) -> list[tuple[int, int, int]]:
 
 def breaks(recording: Recording) -> dict[str, list[float]]:
     """Times in s of the events that say that something went wrong, by their names."""
-    table = recording.tables.get("/event")
+    table = recording.tables.get(EVENTS.topic)
     found: dict[str, list[float]] = {}
     if table is not None and table.rows:
         for tick, name in zip(table.ticks.tolist(), table.column("name"), strict=True):

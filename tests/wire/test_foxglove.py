@@ -23,7 +23,7 @@ ARM = [(0.0, 0.0), (0.5, 0.1234567), (0.9, 0.3)]
 
 
 def test_a_scene_has_both_arms_and_the_reference() -> None:
-    scene = scene_update(1_500_000_000, ARM, ARM[:2], [(0.8, 0.4)])
+    scene = scene_update(1_500_000_000, ARM, ARM[:2], (0.8, 0.4))
     true, estimated, tip = scene["entities"]
     assert [true["id"], estimated["id"], tip["id"]] == [TRUE_ARM, ESTIMATED_ARM, REFERENCE_TIP]
     assert true["timestamp"] == {"sec": 1, "nsec": 500_000_000}
@@ -35,7 +35,7 @@ def test_a_scene_has_both_arms_and_the_reference() -> None:
 
 
 def test_an_unknown_estimate_is_left_out() -> None:
-    scene = scene_update(0, ARM, None, [(0.8, 0.4)])
+    scene = scene_update(0, ARM, None, (0.8, 0.4))
     assert [entity["id"] for entity in scene["entities"]] == [TRUE_ARM, REFERENCE_TIP]
 
 
