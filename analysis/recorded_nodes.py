@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import msgspec
 
 from analysis.recording import Recording
+from deploy.node_configs import node_configs
 from wire.channels import NODES_ATTACHMENT
 from wire.errors import UsageError
-from wire.run_config import LinkConfig, NodeConfig, SegmentConfig, loads
+from wire.run_config import LinkConfig, NodeConfig, loads
 
-_BATCH_TICKS = 32
 _DEADLINE_S = 5.0
 
 
@@ -58,23 +58,6 @@ def recorded_nodes(recording: Recording) -> RecordedNodes:
 
 
 def _made_again(recording: Recording) -> tuple[NodeConfig, ...]:
-    run, deployment = recording.configuration, recording.deployment
-    references = recording.references
     links = LinkConfig((), (), None, _DEADLINE_S, epoch_ns=None, cpu=None, fifo=None)
-    return tuple(
-        NodeConfig(
-            run_id=run.run_id,
-            index=first,
-            nodes=run.nodes,
-            setpoint=run.setpoint_index,
-            scheduling=run.scheduling,
-            batch_ticks=_BATCH_TICKS,
-            skip_ticks=0 if run.pace is None else run.pace.hold_ticks + 1,
-            links=links,
-            segments=tuple(
-                SegmentConfig(deployment.nodes[j].to_plain(), references.nodes[j].to_plain())
-                for j in range(first, min(first + run.segments_per_process, run.nodes))
-            ),
-        )
-        for first in run.firsts
-    )
+    run, deployment = recording.configuration, recording.deployment
+    return node_configs(run, deployment, recording.references, lambda _: links)

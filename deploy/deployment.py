@@ -106,6 +106,16 @@ class Deployment:
         return replace(self, nodes=tuple(open_nodes), dense=tuple(open_dense))
 
     @property
+    def forward_widths(self) -> tuple[int, ...]:
+        """Numbers in the forward sum that each node receives (0 at the root)."""
+        return tuple(node.forward_received for node in self.nodes)
+
+    @property
+    def backward_widths(self) -> tuple[int, ...]:
+        """Numbers in the backward sum that each node receives (0 at the tip)."""
+        return tuple(node.backward_received for node in self.nodes)
+
+    @property
     def messages_per_tick(self) -> int:
         """Messages between neighbours a tick, 2 (n - 1)."""
         return 2 * (len(self.nodes) - 1)

@@ -178,7 +178,11 @@ def port_taken(port: int, address: str = LOOPBACK) -> str | None:
 
 
 def check_live_port(port: int | None) -> None:
-    """Raise UsageError if the port that is asked for the live page is taken; None and 0 ask for any."""
+    """Raise UsageError if the live page cannot have the port that is asked for; None and 0 ask for any."""
+    if port is not None and not 0 <= port <= 65_535:
+        raise UsageError(
+            f"--live-port: expected 0 (any that is free) or a port up to 65535, got {port}"
+        )
     if port and (reason := port_taken(port)):
         raise UsageError(
             f"--live-port {port}: port {port} of {LOOPBACK} cannot be used ({reason}); give another or "

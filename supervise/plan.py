@@ -10,7 +10,6 @@ import math
 import os
 import secrets
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -19,20 +18,20 @@ from typing import Any
 import msgspec
 
 from deploy import Deployment, SegmentGrid, deploy
+from deploy.node_configs import node_configs
 from deploy.path import References, make_references
 from supervise.endpoints import Endpoints
 from supervise.hosts import Host, this_machine
+from supervise.live_config import live_config, tip_of
 from supervise.options import RunOptions
 from supervise.origin import git_revision, machine_facts, versions
 from supervise.scenario import Course, settle
 from supervise.spacing import spacing_name
 from wire.artefact import GainsArtefact, digest, read_artefact
-from wire.channels import FLUSH_S, FORMAT_VERSION, NODES_ATTACHMENT
+from wire.channels import BATCH_TICKS, FLUSH_S, FORMAT_VERSION, NODES_ATTACHMENT
 from wire.errors import UsageError
-from wire.joints import TipConfig
 from wire.placement import FIFO_PRIORITY
 from wire.run_config import (
-    GoalConfig,
     LinkConfig,
     LiveConfig,
     NodeConfig,
@@ -41,13 +40,9 @@ from wire.run_config import (
     RecorderConfig,
     RunConfig,
     SchedulingConfig,
-    SegmentConfig,
     dumps,
 )
 
-BATCH_TICKS = 32
-GOAL_POINTS = 65
-"""Of a setpoint's shape on the live page."""
 CORES = 2
 """Two sweeps run towards each other; more cores would only add wake-ups across cores (runtime
 figures)."""
@@ -190,29 +185,12 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             fifo=FIFO_PRIORITY if options.fifo else None,
         )
 
-    def node(i: int) -> NodeConfig:
-        own = range(i, min(i + run.segments_per_process, nodes))
+    def node_links(own: range) -> LinkConfig:
         listen = [endpoints.nodes[own[-1]]] if own[-1] < nodes - 1 else []
-        connect = [endpoints.plant, *([endpoints.nodes[i - 1]] if i > 0 else [])]
-        return NodeConfig(
-            run_id=run_id,
-            index=i,
-            nodes=nodes,
-            setpoint=active,
-            scheduling=run.scheduling,
-            batch_ticks=BATCH_TICKS,
-            skip_ticks=0 if run.pace is None else run.pace.hold_ticks + 1,
-            links=links(listen, connect, i),
-            segments=tuple(
-                SegmentConfig(deployment.nodes[j].to_plain(), references.nodes[j].to_plain())
-                for j in own
-            ),
-        )
+        connect = [endpoints.plant, *([endpoints.nodes[own[0] - 1]] if own[0] > 0 else [])]
+        return links(listen, connect, own[0])
 
-    configs = tuple(node(i) for i in run.firsts)
-    forward_widths = tuple(f.forward_received for f in deployment.nodes)
-    backward_widths = tuple(f.backward_received for f in deployment.nodes)
-    tip = TipConfig(references.nodes[-1].to_plain(), deployment.nodes[-1].bend_m)
+    configs = node_configs(run, deployment, references, node_links)
     return Plan(
         run=run,
         nodes=configs,
@@ -231,9 +209,9 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         recorder=RecorderConfig(
             run=run,
             path=str(directory / "recording.mcap"),
-            forward_widths=forward_widths,
-            backward_widths=backward_widths,
-            tip=tip,
+            forward_widths=deployment.forward_widths,
+            backward_widths=deployment.backward_widths,
+            tip=tip_of(deployment, references),
             flush_s=FLUSH_S,
             metadata=_metadata(prepared, run, epoch_ns, () if placed is None else hosts),
             attachments={
@@ -245,17 +223,15 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         ),
         live=None
         if not options.live
-        else LiveConfig(
-            run=run,
-            port=options.live_port or 0,
-            forward_widths=forward_widths,
-            backward_widths=backward_widths,
-            tip=tip,
-            goals=goals_of(artefact, sorted(run.scheduling.setpoints)),
-            elsewhere=tuple(sorted(elsewhere)),
-            period_s=run.tick_s if run.pace is None else run.pace.period_s,
-            replay_from=None,
+        else live_config(
+            run,
+            artefact,
+            deployment,
+            references,
             links=links([], [endpoints.plant]),
+            port=options.live_port or 0,
+            elsewhere=elsewhere,
+            period_s=run.tick_s if run.pace is None else run.pace.period_s,
         ),
         endpoints=endpoints,
         directory=directory,
@@ -272,15 +248,6 @@ def _pace(options: RunOptions) -> PaceConfig | None:
         return None
     period_s = options.tick_s if options.period_s is None else options.period_s
     return PaceConfig(period_s, options.hold_ticks)
-
-
-def goals_of(artefact: GainsArtefact, indices: Sequence[int]) -> tuple[GoalConfig, ...]:
-    """Setpoints as shapes, for the live page."""
-    from analysis.goals import setpoint_shape
-
-    length_m = artefact.arm.length_m
-    shapes = {i: setpoint_shape(artefact.setpoints[i], length_m, GOAL_POINTS) for i in indices}
-    return tuple(GoalConfig(i, tuple(map(tuple, one.tolist()))) for i, one in shapes.items())
 
 
 def _cores(nodes: int) -> list[int | None]:

@@ -17,11 +17,9 @@ from analysis.link_times import own_clocks
 from analysis.recording import Recording
 from analysis.replay_check import Span
 from supervise.children import Process, ending, module
-from supervise.endpoints import check_live_port
-from supervise.plan import goals_of
+from supervise.live_config import live_config
 from wire.child import Deadline
 from wire.errors import OctarmError
-from wire.joints import TipConfig
 from wire.run_config import LinkConfig, LiveConfig, dumps
 
 START_S = 20.0
@@ -29,22 +27,19 @@ GRACE_S = 3.0
 _POLL_S = 0.02
 
 
-def live_config(
-    recording: Recording, span: Span, rate: float, port: int | None, endpoint: str
-) -> LiveConfig:
+def page_of(recording: Recording, span: Span, rate: float, port: int, endpoint: str) -> LiveConfig:
     """What the page's process must know to show this part of a recording, published at this rate."""
-    run, deployment = recording.configuration, recording.deployment
-    return LiveConfig(
-        run=run,
-        port=port or 0,
-        forward_widths=tuple(node.forward_received for node in deployment.nodes),
-        backward_widths=tuple(node.backward_received for node in deployment.nodes),
-        tip=TipConfig(recording.references.nodes[-1].to_plain(), deployment.nodes[-1].bend_m),
-        goals=goals_of(recording.artefact, sorted(run.scheduling.setpoints)),
-        elsewhere=tuple(sorted(own_clocks(recording.facts.get("hosts"), run.nodes, []))),
+    run = recording.configuration
+    return live_config(
+        run,
+        recording.artefact,
+        recording.deployment,
+        recording.references,
+        links=LinkConfig((), (endpoint,), None, 5.0, epoch_ns=0, cpu=None, fifo=None),
+        port=port,
+        elsewhere=own_clocks(recording.facts.get("hosts"), run.nodes, []),
         period_s=run.tick_s / rate,
         replay_from=span.first,
-        links=LinkConfig((), (endpoint,), None, 5.0, epoch_ns=0, cpu=None, fifo=None),
     )
 
 
@@ -55,8 +50,6 @@ class LivePage:
     """
 
     def __init__(self, config: LiveConfig, gone: Callable[[str], None]) -> None:
-        """Raises UsageError if the port is taken."""
-        check_live_port(config.port)
         self._config = config
         self._gone = gone
         self._finished = False

@@ -144,9 +144,11 @@ def _one_process(
 
 
 def _publish(options: Options, tell: Tell) -> Done:
-    from supervise.replay_live import LivePage, live_config
+    from supervise.endpoints import check_live_port
+    from supervise.replay_live import LivePage, page_of
     from supervise.replay_publish import Publisher
 
+    check_live_port(options.live_port)
     recording = read_recording(find_recording(options.recording))
     rate = 1.0 if options.rate is None else options.rate
     publisher = Publisher(
@@ -167,11 +169,11 @@ def _publish(options: Options, tell: Tell) -> Done:
     with publisher, contextlib.ExitStack() as stack:
         tell(f"publishing {recording.path} on {publisher.endpoint}")
         if options.live:
-            config = live_config(
+            config = page_of(
                 recording,
                 options.span(recording.tick_s),
                 rate,
-                options.live_port,
+                options.live_port or 0,
                 publisher.endpoint,
             )
             page = stack.enter_context(LivePage(config, gone))

@@ -172,6 +172,17 @@ class Start:
         return self("run", "--gains", self.gains, *arguments, within=within)
 
 
+@contextlib.contextmanager
+def one_run(work: Path, gains: Path, *arguments: str) -> Iterator[Path]:
+    """The recording of a run that has finished well, for several tests."""
+    cli = Start(work, gains).run(*arguments, "--no-plot", "--quiet")
+    try:
+        assert cli.finish() == 0, cli.err
+        yield cli.recording()
+    finally:
+        cli.close()
+
+
 @pytest.fixture(scope="session")
 def gains(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_gains(tmp_path_factory.mktemp("gains") / "test.gains.json")

@@ -27,6 +27,8 @@ LOSS_S = 0.5
 """A run that is killed loses no more of its recording than this, or the tick that it was in.
 
 Rows wait `BATCH_NS` at most with their sender and `FLUSH_S` in the recorder; the rest is for the way."""
+BATCH_TICKS = 32
+"""Rows in a batch at most."""
 BATCH_NS = 150_000_000
 """Rows do not wait longer than this for a batch to fill, while ticks go on."""
 FLUSH_S = 0.2

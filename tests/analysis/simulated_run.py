@@ -19,7 +19,8 @@ import numpy.typing as npt
 from closed_form import artefact
 
 from deploy import Deployment, SegmentGrid, deploy
-from deploy.path import References, make_references
+from deploy.node_configs import node_configs
+from deploy.path import make_references
 from node.scheduling import Sectors
 from node.sweep import NodeSweep
 from plant.disturbance import DisturbanceSpec
@@ -41,17 +42,16 @@ from wire.run_config import (
     DisturbanceConfig,
     LegConfig,
     LinkConfig,
-    NodeConfig,
     NoiseConfig,
     PaceConfig,
     RunConfig,
     SchedulingConfig,
-    SegmentConfig,
     dumps,
 )
 
 Array = npt.NDArray[np.float64]
 
+LINKS = LinkConfig((), (), None, deadline_s=5.0, epoch_ns=0, cpu=None, fifo=None)
 BYTES_PER_MESSAGE = 71
 """Made up: these recordings were never on a wire."""
 
@@ -135,27 +135,6 @@ def run_config(
     )
 
 
-def node_configs(
-    run: RunConfig, deployment: Deployment, references: References
-) -> list[NodeConfig]:
-    """What each node process would have got."""
-    links = LinkConfig((), (), None, deadline_s=5.0, epoch_ns=0, cpu=None, fifo=None)
-    return [
-        NodeConfig(
-            run_id=run.run_id,
-            index=i,
-            nodes=run.nodes,
-            setpoint=run.setpoint_index,
-            scheduling=run.scheduling,
-            batch_ticks=32,
-            skip_ticks=0 if run.pace is None else run.pace.hold_ticks + 1,
-            links=links,
-            segments=(SegmentConfig(node.to_plain(), references.nodes[i].to_plain()),),
-        )
-        for i, node in enumerate(deployment.nodes)
-    ]
-
-
 def write_recording(
     path: Path,
     scenario: Scenario = Scenario(),
@@ -199,6 +178,7 @@ def write_recording(
     )
     growing = path.with_suffix(".growing")
     writer = RecordingWriter(growing, run.tick_s, layout, flush_s=math.inf)
+    configs = node_configs(run, deployment, references, lambda _: LINKS)
     writer.head(
         {
             "format_version": str(FORMAT_VERSION),
@@ -210,7 +190,7 @@ def write_recording(
         },
         {
             "gains.json": attached.read_text(),
-            NODES_ATTACHMENT: f"[{','.join(map(dumps, node_configs(run, deployment, references)))}]",
+            NODES_ATTACHMENT: f"[{','.join(map(dumps, configs))}]",
         },
     )
     sweeps = [

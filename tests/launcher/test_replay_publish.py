@@ -33,15 +33,12 @@ LIMIT_S = 60.0
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory, gains: Path) -> Iterator[Path]:
-    from conftest import Start
+    from conftest import one_run
 
-    starter = Start(tmp_path_factory.mktemp("run"), gains)
-    cli = starter.run("--nodes", str(NODES), "--ticks", str(TICKS), "--no-plot", "--quiet")
-    try:
-        assert cli.finish() == 0, cli.err
-        yield cli.recording()
-    finally:
-        cli.close()
+    with one_run(
+        tmp_path_factory.mktemp("run"), gains, "--nodes", str(NODES), "--ticks", str(TICKS)
+    ) as path:
+        yield path
 
 
 @pytest.fixture(scope="module")

@@ -41,15 +41,10 @@ move_s = 4.0
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory, gains: Path) -> Iterator[Path]:
     """A run of two nodes, long enough to be caught in the middle of its replay."""
-    from conftest import Start
+    from conftest import one_run
 
-    starter = Start(tmp_path_factory.mktemp("run"), gains)
-    cli = starter.run("--nodes", "2", "--ticks", "3000", *QUIET)
-    try:
-        assert cli.finish() == 0, cli.err
-        yield cli.recording()
-    finally:
-        cli.close()
+    with one_run(tmp_path_factory.mktemp("run"), gains, "--nodes", "2", "--ticks", "3000") as path:
+        yield path
 
 
 class Replay:
