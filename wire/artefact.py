@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from wire.errors import GainsRefusedError, UsageError
-from wire.files import write_whole
+from wire.files import DATA_BYTES, read_limited, write_whole
 
 FORMAT = "octarm-gains"
 VERSION = 2
@@ -238,7 +238,7 @@ def read_artefact(path: Path) -> GainsArtefact:
     artefact of this version.
     """
     try:
-        raw = path.read_bytes()
+        raw = read_limited(path, DATA_BYTES)
     except OSError as error:
         raise UsageError(
             f"gains artefact {path}: {error.strerror or error}; make one with `octarm design` or give "
@@ -263,6 +263,8 @@ def parse_artefact(raw: bytes, where: str) -> GainsArtefact:
         raise GainsRefusedError(
             f"{where}: expected format {FORMAT!r}, got {file.format!r}; {remedy}"
         )
+    if file.version > VERSION:
+        remedy = f"a newer octarm wrote it: update this one, or {remedy}"
     if not OLDEST_VERSION <= file.version <= VERSION:
         raise GainsRefusedError(
             f"{where}: format version {file.version}, this octarm reads {OLDEST_VERSION} to {VERSION}; {remedy}"

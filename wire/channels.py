@@ -13,13 +13,16 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntFlag
 from typing import Any
 
 from wire.columns import channel_name, description, unit
 
-FORMAT_VERSION = 4
-READABLE = (3, 4)
+FORMAT_VERSION = 5
+READABLE = (3, 4, 5)
 """Versions that this octarm reads; others are refused by name."""
+DEGRADED_SINCE = 5
+"""The version that has the channels of `before_version_5`."""
 NODES_ATTACHMENT = "nodes.json"
 """Attached since version 4: a JSON list of the configurations (wire.run_config.NodeConfig) that the node
 processes got, with matrices and references bit for bit."""
@@ -37,6 +40,8 @@ SHAPE_POINTS = 33
 """Points along the arm in /plant/shape, equally spaced in arclength, root and tip included."""
 METADATA = "octarm"
 SUMMARY = "summary"
+REFUSED = "refused_peers"
+"""In the summary of a run to which somebody came who was not let in: a JSON list of by, what and count."""
 
 MEASUREMENT = ("velocity_y_m_per_s", "curvature_per_m")
 STATE = ("velocity_x_m_per_s", "velocity_y_m_per_s", "strain", "curvature_per_m")
@@ -54,6 +59,11 @@ SHAPE = tuple(f"{axis}{i:02d}_m" for i in range(SHAPE_POINTS) for axis in "xy")
 PACE = ("late",)
 """1 if in real time the sweep before was not finished at this tick's begin, so that this tick has none and the
 commands are held; else 0."""
+DEGRADED = ("flags",)
+"""How a node's tick was other than it should be, since version 5: a sum of `Degraded`, 0 if all was well."""
+GUARD = ("passive", "load_potential_j")
+"""Since version 5: 1 if the arm is passive (static loads only, whatever the nodes say), else 0; and the
+potential of the loads in force: with kinetic, axial and bending energy it makes what only damping can take."""
 SWEEP_TIMING = ("due_wall_ns", "started_wall_ns", "duration_wall_ns", "advance_wall_ns")
 """When the tick should begin (in lock-step: when it did); its first measurement sent; from there to the last
 command received by the plant (0: not within this tick; a late tick has it of the sweep that ended in it); and
@@ -68,6 +78,37 @@ LATE_AT = -len(SWEEP_TIMING) - len(PACE)
 """Where the plant's row says whether the tick had no sweep."""
 EVENT = ("timestamp", "level", "name", "message", "file", "line")
 """Fields of foxglove.Log."""
+
+
+class Degraded(IntFlag):
+    """What was other than it should be in a node's tick."""
+
+    FORWARD_BRIDGED = 1
+    """The forward sum did not come in time: the last one was used, faded."""
+    BACKWARD_BRIDGED = 2
+    """The same of the backward sum."""
+    HELD = 4
+    """The tick was given up before it was complete: its command was not sent, the last one is held."""
+    PARTIAL = 8
+    """The forward sum that came does not reach back to the root: a sum before it was bridged."""
+    MEASUREMENT_HELD = 16
+    """The measurement did not come: the last one was used."""
+    JOINED = 32
+    """The node replaces a dead one and begins in this tick."""
+
+
+class Health(IntFlag):
+    """Three things that the plant knows of a node in a tick, each by itself."""
+
+    ALIVE = 1
+    """Its process is there: its token is."""
+    ON_TIME = 2
+    """Its command came before the next tick was due."""
+    VALID = 4
+    """Nothing that it sent was refused, other than for being late."""
+
+
+WELL = int(Health.ALIVE | Health.ON_TIME | Health.VALID)
 
 
 @dataclass(frozen=True)
@@ -146,6 +187,7 @@ def node_channels(index: int, nodes: int, forward: int, backward: int) -> list[C
         sums = tuple(f"d{i}" for i in range(backward - len(ANNOUNCED)))
         channels.append(Channel(f"{root}/backward_sum", (*sums, *ANNOUNCED)))
     channels.append(Channel(f"{root}/timing", timing_fields(index, nodes)))
+    channels.append(Channel(f"{root}/degraded", DEGRADED))
     return channels
 
 
@@ -157,6 +199,8 @@ def plant_channels(nodes: int) -> list[Channel]:
         Channel("/plant/energy", ENERGY),
         Channel("/plant/regulated", REGULATED),
         Channel("/plant/shape", SHAPE),
+        Channel("/plant/health", tuple(f"node_{label(i, nodes)}" for i in range(nodes))),
+        Channel("/plant/guard", GUARD),
         Channel("/plant/pace", PACE),
         Channel("/sweep/timing", SWEEP_TIMING),
     ]
@@ -165,6 +209,13 @@ def plant_channels(nodes: int) -> list[Channel]:
 def width(channels: Sequence[Channel]) -> int:
     """Numbers in a telemetry row with these channels."""
     return sum(len(channel.fields) for channel in channels)
+
+
+def before_version_5(channel: Channel) -> list[float] | None:
+    """What a channel that older recordings lack would have said; None for channels that they have."""
+    name = channel_name(channel.topic)
+    well = {"degraded": 0.0, "guard": 0.0, "health": float(WELL)}
+    return [well[name]] * len(channel.fields) if name in well else None
 
 
 def columns_of(channels: Sequence[Channel], topic: str, *fields: str) -> slice:

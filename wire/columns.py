@@ -71,6 +71,14 @@ DESCRIPTIONS: dict[str, dict[str, str]] = {
         "mean_velocity_y_m_per_s": "mean over the arm of the velocity along y, less the reference's",
         "mean_curvature_per_m": "mean over the arm of the curvature, less the reference's",
     },
+    "degraded": {
+        "flags": "sum of 1 forward sum bridged, 2 backward sum bridged, 4 command held, 8 forward sum not "
+        "of the whole arm, 16 measurement held, 32 joined in this tick; 0: all well"
+    },
+    "guard": {
+        "passive": "1: static loads only, whatever the nodes say; else 0",
+        "load_potential_j": "potential of the loads in force, zero for the straight arm",
+    },
     "pace": {"late": "1: the sweep before was not over when this tick was due; else 0"},
     "sweep_timing": {
         "due_wall_ns": "instant at which the tick was due",
@@ -80,7 +88,8 @@ DESCRIPTIONS: dict[str, dict[str, str]] = {
     },
     "event": {
         "level": "debug, info, warning, error or fatal",
-        "name": "started, setpoint, late, telemetry_lost, finished, interrupted or safety_stop",
+        "name": "started, setpoint, late, node_gone, node_back, passive, telemetry_lost, disk_full, "
+        "refused_peer, finished, interrupted or safety_stop",
         "message": "what happened, for a person",
     },
 }
@@ -113,6 +122,9 @@ def description(channel: str, field: str) -> str:
         return _GENERAL[field]
     if SUM_NUMBER.fullmatch(field):
         return f"received: number {field[1:]} of the {channel.replace('_', ' ')}"
+    if channel == "health":
+        of = "what the plant knows of the node" if field == "flags" else f"of node {int(field[5:])}"
+        return f"{of}: sum of 1 alive, 2 on time, 4 valid"
     if channel == "shape":
         axis, number = field[0], int(field[1:3])
         return f"{axis} of point {number} along the arm, root first, equally spaced in arclength"

@@ -182,10 +182,17 @@ class NodeFactors:
             raise UsageError(
                 f"factors of a node: {error} is missing; deploy the gains again"
             ) from None
+        if type(index) is not int or type(nodes) is not int or type(setpoints) is not list:
+            raise UsageError(
+                "factors of a node: expected whole numbers index and nodes and a list of setpoints; "
+                "deploy the gains again"
+            )
+        if type(bend) is not float:
+            raise UsageError("factors of a node, bend_m: expected a number; deploy the gains again")
         return cls(
-            index=int(index),
-            nodes=int(nodes),
-            bend_m=float(bend),
+            index=index,
+            nodes=nodes,
+            bend_m=bend,
             initial_estimate=_unpack(plain, "initial_estimate"),
             initial_command=_unpack(plain, "initial_command"),
             setpoints=tuple(SweepFactors.from_plain(factors) for factors in setpoints),
@@ -208,7 +215,7 @@ def _unpack(plain: Mapping[str, Any], key: str) -> Array:
     try:
         *shape, raw = plain[key]
         array = np.frombuffer(raw, dtype="<f8").reshape(shape).astype(np.float64)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, MemoryError) as error:
         raise UsageError(
             f"factor {key}: expected [shape..., float64 bytes], got none ({error}); "
             "deploy the gains again"

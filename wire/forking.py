@@ -13,12 +13,27 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from typing import Protocol, TypeVar
 
 from wire.child import Child, die_with_parent, name_process, send_status
+from wire.config_json import loads
 from wire.errors import ExitCode, OctarmError
+from wire.limits import refusal
 
+USAGE = int(ExitCode.USAGE)
 GRACE_S = 1.0
 """Between the request to end and the end by force, when the forking process itself has to stop its children."""
+
+
+class Numbered(Protocol):
+    """A configuration of one of several children."""
+
+    @property
+    def index(self) -> int:
+        """The child's number."""
+
+
+Config = TypeVar("Config", bound=Numbered)
 
 
 class Nursery:
@@ -35,10 +50,29 @@ class Nursery:
         gc.freeze()
         child.status("up")
 
+    def birth(
+        self, line: bytes, kind: type[Config], what: str, live: Callable[[Config, int], int]
+    ) -> None:
+        """Fork the child that a line configures; `live` gets the configuration and this process's number.
+
+        What is wrong with the line, a `what` in words, is told to the launcher.
+        """
+        try:
+            config = loads(kind, line, what)
+        except OctarmError as error:
+            self._child.status("failed", code="configuration", message=str(error))
+            return
+        self.fork(config.index, lambda own: live(config, own))
+
     def fork(self, index: int, live: Callable[[int], int]) -> None:
         """Fork the child with this number; `live` gets this process's number and returns the exit code."""
         own = os.getpid()
-        pid = os.fork()
+        try:
+            pid = os.fork()
+        except OSError as error:
+            text = f"process {index} cannot be forked: {refusal(error) or error.strerror}"
+            self._child.status("failed", code="limit", exit=USAGE, message=text)
+            return
         if pid == 0:
             code = 1
             try:
@@ -82,9 +116,17 @@ def life(name: str, short: str, parent: int, run: Callable[[], int]) -> int:
         name_process(short)
         return run()
     except OctarmError as error:
-        send_status(1, name, "failed", code="configuration", message=f"{name}: {error}")
+        exit_code = int(error.exit_code)
+        send_status(
+            1, name, "failed", code="configuration", exit=exit_code, message=f"{name}: {error}"
+        )
         return int(error.exit_code)
-    except Exception as error:
+    except SystemExit:
+        raise
+    except BaseException as error:  # a panic of native code is no Exception
+        if reason := refusal(error):
+            send_status(1, name, "failed", code="limit", exit=USAGE, message=f"{name}: {reason}")
+            return USAGE
         traceback.print_exc()
         send_status(1, name, "failed", code="internal", message=f"{name}: {error!r}")
         return int(ExitCode.INTERNAL)

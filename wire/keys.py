@@ -32,6 +32,10 @@ class Keys:
         """Node + 1 -> node: the backward sum d that `node` receives."""
         return f"{self.root}/node/{node}/backward"
 
+    def state(self, node: int, sender: int) -> str:
+        """Neighbour `sender` -> node: its estimate, while `node` is about to replace a dead process."""
+        return f"{self.root}/node/{node}/state/{sender}"
+
     def command(self, node: int) -> str:
         """Node -> plant: u_i(k+1)."""
         return f"{self.root}/plant/command/{node}"

@@ -1,12 +1,15 @@
 """The messages on the wire: seven fields in a msgpack list, refused with a named reason when
 anything is off.
 
-Data flow: plant -> node (measurement), node -> node (running sums), node -> plant (command), every
-process -> recorder (telemetry, counters), plant -> all (stop).
+Data flow: plant -> node (measurement), node -> node (running sums; state, for one that replaces a dead node),
+node -> plant (command), every process -> recorder (telemetry, counters), plant -> all (stop).
 
 A message is `[version, kind, run, tick, sender, setpoint, payload]`: five integers that say what it
 is and where it belongs, the index of the active setpoint (theory, section 5: one set of sweep
-matrices a setpoint; of a command: the setpoint of the tick in which it is applied), and the payload.
+matrices a setpoint; of a command: the setpoint of the tick in which it is applied), and the payload. A forward
+sum that does not reach back to the root, because a sum before it did not come, says so in the highest bit of
+the setpoint (`PARTIAL`).
+
 The payload of the control kinds is their doubles as bytes, little-endian; that of the others is stated at
 their encoder. Control messages come every tick, so they are written with integers of fixed width: all that
 differs from tick to tick stands at a fixed place (`Outgoing`), and a receiver knows the first 32 bytes
@@ -26,7 +29,9 @@ import msgpack
 import numpy as np
 import numpy.typing as npt
 
-VERSION = 3
+from wire.errors import shown
+
+VERSION = 4
 PLANT = -1
 """The sender number of the plant; nodes send their index 0..n-1."""
 FIELDS = 7
@@ -48,6 +53,8 @@ HEADER_BYTES = _HEADER.size
 """Of a control message; its doubles follow, aligned."""
 MOST_NUMBERS = 0xFFFF // 8
 """Doubles that a control message can carry."""
+PARTIAL = 0x8000
+"""In the setpoint of a forward sum: a sum before it was missing, so that it is not of the whole arm."""
 F8 = np.dtype("<f8")
 Array = npt.NDArray[np.float64]
 
@@ -62,6 +69,10 @@ class Kind(IntEnum):
     TELEMETRY = 5
     COUNTERS = 6
     STOP = 7
+    STATE = 8
+
+
+_KINDS = frozenset(map(int, Kind))
 
 
 class Reason(StrEnum):
@@ -80,6 +91,8 @@ class Reason(StrEnum):
     STALE = "stale"
     EARLY = "early"
     DUPLICATE = "duplicate"
+    LATE = "late"
+    """A sum whose tick has gone on without it."""
 
 
 class RejectedError(Exception):
@@ -98,6 +111,8 @@ class Numbers(NamedTuple):
     sender: int
     setpoint: int
     values: list[float]
+    partial: bool = False
+    """Of a forward sum: `PARTIAL`."""
 
 
 class Batch(NamedTuple):
@@ -243,6 +258,8 @@ def decode_numbers(
     tick, came_from, setpoint, payload = _fields(raw, kind, run)
     if came_from != sender:
         raise RejectedError(Reason.SENDER, f"expected sender {sender}, got {came_from}")
+    partial = kind is Kind.FORWARD_SUM and bool(setpoint & PARTIAL)
+    setpoint ^= PARTIAL if partial else 0
     if not 0 <= setpoint < len(lengths):
         raise RejectedError(Reason.SETPOINT, f"expected 0..{len(lengths) - 1}, got {setpoint}")
     if type(payload) is not bytes:
@@ -253,8 +270,9 @@ def decode_numbers(
     values = list(struct.unpack(f"<{expected}d", payload))
     # One sum decides the usual case; it may overflow where every term is finite.
     if not math.isfinite(sum(values)) and not all(map(math.isfinite, values)):
-        raise RejectedError(Reason.NOT_FINITE, f"got {values}")
-    return Numbers(tick, came_from, setpoint, values)
+        at = next(i for i, value in enumerate(values) if not math.isfinite(value))
+        raise RejectedError(Reason.NOT_FINITE, f"number {at} is {values[at]}")
+    return Numbers(tick, came_from, setpoint, values, partial)
 
 
 def decode_batch(raw: bytes, run: int, columns: Mapping[int, int]) -> Batch:
@@ -266,7 +284,9 @@ def decode_batch(raw: bytes, run: int, columns: Mapping[int, int]) -> Batch:
         raise RejectedError(Reason.TYPE, "expected [columns, bytes]")
     width, data = payload
     if type(width) is not int or width != columns[sender]:
-        raise RejectedError(Reason.LENGTH, f"expected {columns[sender]} columns, got {width!r}")
+        raise RejectedError(
+            Reason.LENGTH, f"expected {columns[sender]} columns, got {shown(width)}"
+        )
     if not data or len(data) % (8 * width):
         raise RejectedError(Reason.LENGTH, f"{len(data)} bytes are no whole number of rows")
     rows = np.frombuffer(data, dtype=F8).reshape(-1, width)
@@ -306,11 +326,10 @@ def decode_stop(raw: bytes, run: int) -> Stop:
 
 def kind_of(raw: bytes) -> Kind:
     """The kind of a message without checking the rest (the recorder sorts by it)."""
-    fields = _unpack(raw)
-    try:
-        return Kind(fields[1])
-    except ValueError:
-        raise RejectedError(Reason.KIND, f"unknown kind {fields[1]!r}"[:80]) from None
+    kind = _unpack(raw)[1]
+    if type(kind) is not int or kind not in _KINDS:
+        raise RejectedError(Reason.KIND, f"unknown kind {shown(kind)}")
+    return Kind(kind)
 
 
 def _unpack(raw: bytes) -> list[Any]:
@@ -327,17 +346,17 @@ def _fields(raw: bytes, kind: Kind, run: int) -> tuple[int, int, int, Any]:
     """Check the fields that every kind has; returns tick, sender, setpoint, payload."""
     version, came_kind, came_run, tick, sender, setpoint, payload = _unpack(raw)
     if type(version) is not int or version != VERSION:
-        raise RejectedError(Reason.VERSION, f"expected version {VERSION}, got {version!r}"[:80])
+        raise RejectedError(Reason.VERSION, f"expected version {VERSION}, got {shown(version)}")
     if type(came_kind) is not int or came_kind != kind:
-        raise RejectedError(Reason.KIND, f"expected kind {int(kind)}, got {came_kind!r}"[:80])
+        raise RejectedError(Reason.KIND, f"expected kind {int(kind)}, got {shown(came_kind)}")
     if type(came_run) is not int or came_run != run:
         raise RejectedError(Reason.RUN, "the message belongs to another run")
     if type(tick) is not int or not 0 <= tick <= LARGEST_TICK:
-        raise RejectedError(Reason.TICK, f"expected a tick number, got {tick!r}"[:80])
+        raise RejectedError(Reason.TICK, f"expected a tick number, got {shown(tick)}")
     if type(sender) is not int:
-        raise RejectedError(Reason.SENDER, f"expected a number, got {sender!r}"[:80])
+        raise RejectedError(Reason.SENDER, f"expected a number, got {shown(sender)}")
     if type(setpoint) is not int:
-        raise RejectedError(Reason.SETPOINT, f"expected an index, got {setpoint!r}"[:80])
+        raise RejectedError(Reason.SETPOINT, f"expected an index, got {shown(setpoint)}")
     return tick, sender, setpoint, payload
 
 

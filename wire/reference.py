@@ -78,6 +78,14 @@ class Reference:
     def __init__(self, tick_s: float, legs: Sequence[Leg], held: int | None = None) -> None:
         if not legs:
             raise UsageError("reference: no leg; a rest is one of 0 s")
+        if not (math.isfinite(tick_s) and tick_s > 0.0):
+            raise UsageError(f"reference: expected a tick of a positive time, got {tick_s!r} s")
+        shapes = {leg.coefficients.shape[1] for leg in legs}
+        if len(shapes) > 1 or not (held is None or 0 <= held < min(shapes)):
+            raise UsageError(
+                f"reference: legs of {sorted(shapes)} quantities, of which number {held} is held; expected "
+                "legs of the same quantities"
+            )
         begins = [leg.begin_s for leg in legs]
         ends = [leg.begin_s + leg.move_s for leg in legs]
         if any(after < before - 1e-9 for before, after in zip(ends, begins[1:], strict=False)):
@@ -156,7 +164,7 @@ class Reference:
             ]
             held = plain["held"]
             return cls(float(plain["tick_s"]), legs, None if held is None else int(held))
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, MemoryError) as error:
             raise UsageError(f"reference: damaged ({error}); deploy the gains again") from None
 
 

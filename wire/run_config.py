@@ -1,26 +1,27 @@
 """What the launcher tells each process of a run, as JSON: the run itself and one configuration a
 process.
 
-Made once by the launcher, sent to the children as one line each (or a file, for a node started by
-hand), and written into the recording, so that a run can be understood and recomputed from its
+Made once by the launcher, sent to the children as one line each (`wire.config_json`; or a file, for a node
+started by hand), and written into the recording, so that a run can be understood and recomputed from its
 recording alone.
 """
 
 from __future__ import annotations
 
-import base64
 import dataclasses
-import json
 import math
-import types
-import typing
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from wire.errors import UsageError
 from wire.joints import TipConfig
 
-T = TypeVar("T")
+MOST_TICKS = 10_000_000
+"""Of a run: a recording of so many has tens of gigabytes."""
+SHORTEST_TICK_S = 1e-9
+"""Instants are recorded in whole nanoseconds."""
+LONGEST_RUN_S = 9e9
+"""So many nanoseconds have 64 bits; 285 years."""
 
 
 @dataclass(frozen=True)
@@ -144,16 +145,29 @@ class RunConfig:
     """How many segments a node process has; the last one may have fewer."""
     pace: PaceConfig | None
     """None: lock-step, as fast as the machine goes."""
+    restart: bool = dataclasses.field(default=False, metadata={"missing": False})
+    """Whether a dead node is replaced while the others go on."""
+    plant_model: str = dataclasses.field(default="exact", metadata={"missing": "exact"})
+    """What moves the emulated arm: see plant.truncated_force."""
 
     def __post_init__(self) -> None:
         if self.nodes < 2:
             raise UsageError(f"nodes: expected at least 2, got {self.nodes}")
-        if self.ticks < 1:
-            raise UsageError(f"ticks: expected at least 1, got {self.ticks}")
-        if not (math.isfinite(self.tick_s) and self.tick_s > 0.0):
-            raise UsageError(f"tick_s: expected a positive number of seconds, got {self.tick_s!r}")
+        if not 1 <= self.ticks <= MOST_TICKS:
+            raise UsageError(f"ticks: expected 1..{MOST_TICKS}, got {self.ticks}")
+        if not SHORTEST_TICK_S <= self.tick_s <= LONGEST_RUN_S / self.ticks:
+            raise UsageError(
+                f"tick_s: expected {SHORTEST_TICK_S:g} s to {LONGEST_RUN_S / self.ticks:g} s for "
+                f"{self.ticks} ticks, got {self.tick_s!r}"
+            )
         if len(self.faces_m) != self.nodes + 1:
             raise UsageError(f"faces_m: expected {self.nodes + 1} numbers, got {len(self.faces_m)}")
+        shapes = {"initial_estimates": 4, "energy_weights": 4, "initial_commands_n_per_m": None}
+        for key, columns in shapes.items():
+            rows = getattr(self, key)
+            if len(rows) != self.nodes or (columns and any(len(row) != columns for row in rows)):
+                each = f" of {columns} numbers each" if columns else ""
+                raise UsageError(f"{key}: expected {self.nodes} entries{each}, got others")
         if not (math.isfinite(self.first_hold_s) and self.first_hold_s >= 0.0):
             raise UsageError(f"first_hold_s: expected 0 s or more, got {self.first_hold_s!r}")
         for name in (self.setpoint, *(n for leg in self.legs for n in (*leg.through, leg.to))):
@@ -166,6 +180,11 @@ class RunConfig:
         count = len(self.setpoint_names)
         if any(not 0 <= index < count for index in self.scheduling.setpoints):
             raise UsageError(f"scheduling: setpoints {self.scheduling.setpoints} of {count}")
+        if self.setpoint_index not in self.scheduling.setpoints:
+            raise UsageError(
+                f"scheduling: setpoints {self.scheduling.setpoints} without {self.setpoint_index}, the one at "
+                "the start"
+            )
 
     @property
     def setpoint_index(self) -> int:
@@ -176,6 +195,28 @@ class RunConfig:
     def firsts(self) -> tuple[int, ...]:
         """The first segment of each node process: what the process is called by."""
         return tuple(range(0, self.nodes, self.segments_per_process))
+
+
+@dataclass(frozen=True)
+class TlsConfig:
+    """How a process proves who it is, and whom it believes. Files by their paths on its own machine."""
+
+    name: str
+    """The process, as its certificate has it (wire.access)."""
+    identity: str
+    """Its Zenoh number in this run, hexadecimal: made by the launcher, known to itself and its peers."""
+    authority: str
+    """The certificate of the authority that all certificates of the run must be signed by."""
+    certificate: str
+    private_key: str
+    peers: dict[str, str]
+    """Whom it has links with: names and Zenoh numbers."""
+    access: dict[str, Any]
+    """Zenoh's `access_control`: what each peer may say, and nothing else (wire.access)."""
+
+
+_LATER = {"missing": None}
+"""Of a field that configurations in older recordings do not have."""
 
 
 @dataclass(frozen=True)
@@ -195,6 +236,8 @@ class LinkConfig:
     """The core to run on, None to leave it to the scheduler."""
     fifo: int | None
     """Priority of real-time scheduling (SCHED_FIFO), None for the ordinary one."""
+    tls: TlsConfig | None = dataclasses.field(default=None, metadata=_LATER)
+    """None: whoever reaches the process is believed."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.deadline_s) and self.deadline_s > 0.0):
@@ -232,6 +275,13 @@ class NodeConfig:
     links: LinkConfig
     segments: tuple[SegmentConfig, ...]
     """From the root to the tip; usually one."""
+    left: int = dataclasses.field(default=-1, metadata={"missing": -1})
+    """The node process towards the root, called by its first segment; -1: none, or nobody has said it."""
+    joins: bool = dataclasses.field(default=False, metadata={"missing": False})
+    """It replaces a dead process in a run that goes on."""
+    bridge_s: float = dataclasses.field(default=0.0, metadata={"missing": 0.0})
+    """So long at most a neighbour's sums are bridged without a break; then the node gives up, and the arm goes
+    passive. 0: for ever."""
 
     def __post_init__(self) -> None:
         if not self.segments:
@@ -245,6 +295,8 @@ class NodeConfig:
             raise UsageError(f"batch_ticks: expected at least 1, got {self.batch_ticks}")
         if self.skip_ticks < 0:
             raise UsageError(f"skip_ticks: expected 0 or more, got {self.skip_ticks}")
+        if not (math.isfinite(self.bridge_s) and self.bridge_s >= 0.0):
+            raise UsageError(f"bridge_s: expected 0 s or more, got {self.bridge_s!r}")
 
     @property
     def last(self) -> int:
@@ -323,71 +375,3 @@ class LiveConfig:
             raise UsageError(f"period_s: expected 0 or more seconds, got {self.period_s!r}")
         if not 0 <= self.port <= 65_535:
             raise UsageError(f"port: expected 0..65535, got {self.port}")
-
-
-def dumps(config: Any) -> str:
-    """A configuration as one line of JSON; bytes become {"base64": text}."""
-    data = dataclasses.asdict(config)
-    return json.dumps(data, separators=(",", ":"), allow_nan=False, default=_bytes_out)
-
-
-def _bytes_out(value: Any) -> dict[str, str]:
-    if not isinstance(value, bytes):
-        raise TypeError(f"{type(value).__name__} has no place in a configuration")
-    return {"base64": base64.b64encode(value).decode()}
-
-
-def _bytes_in(data: dict[str, Any]) -> Any:
-    if data.keys() == {"base64"}:
-        return base64.b64decode(data["base64"], validate=True)
-    return data
-
-
-def loads(cls: type[T], text: str | bytes, where: str) -> T:
-    """A configuration from JSON; UsageError names the field that is missing, unknown or of a wrong
-    type."""
-    try:
-        data = json.loads(text, object_hook=_bytes_in)
-    except (ValueError, TypeError, RecursionError) as error:
-        raise UsageError(f"{where}: not JSON ({error})") from None
-    return typing.cast(T, _build(cls, data, where))
-
-
-def _build(cls: Any, data: Any, where: str) -> Any:
-    if not isinstance(data, dict):
-        raise UsageError(f"{where}: expected an object, got {type(data).__name__}")
-    hints = typing.get_type_hints(cls)
-    if missing := sorted(hints.keys() - data.keys()):
-        raise UsageError(f"{where}: {missing[0]} is missing")
-    if unknown := sorted(data.keys() - hints.keys()):
-        raise UsageError(f"{where}: {unknown[0]!r} is not a known field")
-    return cls(**{key: _value(hints[key], data[key], f"{where}.{key}") for key in hints})
-
-
-def _value(hint: Any, data: Any, where: str) -> Any:
-    origin = typing.get_origin(hint)
-    if dataclasses.is_dataclass(hint):
-        return _build(hint, data, where)
-    if origin in (typing.Union, types.UnionType):
-        if data is None:
-            return None
-        return _value(next(a for a in typing.get_args(hint) if a is not type(None)), data, where)
-    if origin is tuple:
-        if not isinstance(data, list):
-            raise UsageError(f"{where}: expected a list, got {type(data).__name__}")
-        inner = typing.get_args(hint)[0]
-        return tuple(_value(inner, item, f"{where}[{i}]") for i, item in enumerate(data))
-    if origin is dict:
-        if not isinstance(data, dict):
-            raise UsageError(f"{where}: expected an object, got {type(data).__name__}")
-        inner = typing.get_args(hint)[1]
-        return {k: _value(inner, v, f"{where}.{k}") for k, v in data.items()}
-    if hint is Any:
-        return data
-    if hint is float and type(data) is int:
-        data = float(data)
-    if type(data) is not hint:
-        raise UsageError(f"{where}: expected {hint.__name__}, got {data!r}"[:300])
-    if hint is float and not math.isfinite(data):
-        raise UsageError(f"{where}: expected a finite number, got {data!r}")
-    return data

@@ -6,13 +6,19 @@ socket.
 
 from __future__ import annotations
 
+import os
+import sys
 import traceback
 from collections.abc import Callable
 from typing import Protocol, TypeVar
 
 from wire.child import Child, die_with_parent, name_process
+from wire.config_json import loads
 from wire.errors import ExitCode, OctarmError
-from wire.run_config import LinkConfig, loads
+from wire.limits import refusal
+from wire.run_config import LinkConfig
+
+USAGE = int(ExitCode.USAGE)
 
 
 class Configuration(Protocol):
@@ -49,11 +55,22 @@ def serve_child(
         endpoints = list(config.links.listen)
         return int(run(config, child))
     except OctarmError as error:
-        child.status("failed", code="configuration", message=str(error))
+        code = int(error.exit_code)
+        child.status("failed", code="configuration", exit=code, message=str(error))
         return int(error.exit_code)
-    except Exception as error:
+    except SystemExit:
+        raise
+    except BaseException as error:  # a panic of native code is no Exception
+        if reason := refusal(error):
+            child.status("failed", code="limit", exit=USAGE, message=f"{name}: {reason}")
+            return USAGE
         traceback.print_exc()
         child.status("failed", code="internal", message=f"{name}: {error!r}")
         return int(ExitCode.INTERNAL)
     finally:
         child.leave(endpoints)
+        if (
+            child.orphaned
+        ):  # nobody asks for the exit code, and a session may still be closing (wire.gate)
+            sys.stderr.flush()
+            os._exit(int(ExitCode.OK))

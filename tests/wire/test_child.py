@@ -6,6 +6,8 @@ import json
 import os
 import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -156,7 +158,7 @@ def test_status_lines_fit_into_one_write(pipes: Pipes) -> None:
     said = json.loads(line)
     assert (said["from"], said["event"], said["tick"]) == ("node 1", "failed", 3)
     pipes.child.status("waiting", missing=["y" * 100] * 1000)
-    assert pipes.said() == {"from": "node 1", "event": "waiting"}
+    assert pipes.said() == {"from": "node 1", "event": "waiting", "missing": ["y" * 100] * 25}
 
 
 def test_sockets_and_their_locks_are_removed(tmp_path: Path) -> None:
@@ -164,3 +166,57 @@ def test_sockets_and_their_locks_are_removed(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     remove_sockets([f"unixsock-stream/{tmp_path}/node0", "tcp/127.0.0.1:9"])
     assert [p.name for p in tmp_path.iterdir()] == ["other"]
+
+
+def test_a_launcher_that_does_not_read_holds_nobody_up(pipes: Pipes) -> None:
+    for tick in range(5000):  # four times what the pipe takes
+        pipes.child.status("progress", tick=tick)
+    said = b""
+    while not said.endswith(b"}\n") or b"4999" not in said:
+        piece = os.read(pipes.status, 1 << 16)
+        said += piece
+        pipes.child.status("progress", tick=4999)
+    ticks = [json.loads(line)["tick"] for line in said.splitlines()]
+    assert ticks[:100] == [*range(100)]
+    assert len(ticks) < 5000
+
+
+_CHILD = """
+import os, sys
+from wire.child import Child, die_with_parent
+die_with_parent(int(sys.argv[1]))
+child = Child("node 1", control=0, status=1, directory=sys.argv[2])
+child.install(reads_control=True)
+child.status("up")
+while not child.stopping:
+    child.wait(None)
+assert os.getppid() == int(sys.argv[1])
+child.leave([])
+"""
+_DYING_PARENT = """
+import ctypes, os, subprocess, sys, threading
+pipe = subprocess.PIPE
+command = [sys.executable, "-c", sys.argv[1], str(os.getpid()), sys.argv[2]]
+child = subprocess.Popen(command, stdin=pipe, stdout=pipe)
+child.stdout.readline()
+def last():
+    os.write(1, b"ended %d" % child.wait(20))
+    os._exit(0)
+threading.Thread(target=last).start()
+ctypes.CDLL(None).syscall(60 if os.uname().machine == "x86_64" else 93, 0)  # exit, of one thread
+"""
+
+
+def test_a_launcher_whose_last_thread_still_lives_is_dead(tmp_path: Path) -> None:
+    """Its first thread can be gone before the others: it is still the parent, the lifeline open."""
+    private = tmp_path / "private"
+    private.mkdir()
+    (private / "plant").touch()
+    done = subprocess.run(
+        [sys.executable, "-c", _DYING_PARENT, _CHILD, str(private)],
+        capture_output=True,
+        timeout=30,
+        check=False,
+    )
+    assert (done.stdout, done.stderr) == (b"ended 0", b"")
+    assert not private.exists()

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from wire.config_json import dumps, loads
 from wire.errors import UsageError
 from wire.run_config import (
     DisturbanceConfig,
@@ -21,8 +22,6 @@ from wire.run_config import (
     RunConfig,
     SchedulingConfig,
     SegmentConfig,
-    dumps,
-    loads,
 )
 
 LINKS = LinkConfig(("a",), ("b", "c"), None, 2.5, 10**18, 1, 10)
@@ -211,3 +210,22 @@ def test_every_segment_is_in_one_process(nodes: int, per_process: int) -> None:
 def test_a_process_without_segments_is_refused(count: int) -> None:
     with pytest.raises(UsageError, match=f"segments_per_process: expected at least 1, got {count}"):
         run(segments_per_process=count)
+
+
+@pytest.mark.parametrize("tick_s", [0.0, -0.1, 5e-324, 9e-10, 9.1e8, float("inf"), float("nan")])
+def test_a_tick_that_cannot_be_recorded_in_nanoseconds_is_refused(tick_s: float) -> None:
+    with pytest.raises(UsageError, match="tick_s: expected 1e-09 s to 9e\\+08 s for 10 ticks, got"):
+        run(tick_s=tick_s)
+    assert run(tick_s=1e-9).tick_s == 1e-9
+
+
+def test_the_setpoint_at_the_start_is_one_that_is_visited() -> None:
+    with pytest.raises(UsageError, match=r"setpoints \(0,\) without 1, the one at the start"):
+        run(scheduling=SchedulingConfig((0,), (), 2.0, 3.0))
+
+
+def test_half_a_surrogate_pair_is_no_text_but_any_name_of_a_file_is() -> None:
+    with pytest.raises(UsageError, match=r"here.run_id: expected text, got '\\ud800'"):
+        loads(RunConfig, dumps(run(run_id="\ud800")), "here")
+    named = run(artefact_path=b"\xff.json".decode(errors="surrogateescape"))
+    assert loads(RunConfig, dumps(named), "here") == named
