@@ -1,6 +1,7 @@
 """A frame of the page: everything about the newest tick that plant and nodes have in common, in plain numbers.
 
-From `live.rows` to the JSON of an event. Positions in m, rounded to what a screen can show; what has not come
+From `live.rows` to the JSON of an event. What a node is, alive, on time
+and valid, is what the plant says. Positions in m, rounded to what a screen can show; what has not come
 is None. The running figures (sweep durations, ticks a second, late ticks) are of the rows that came while
 somebody watched.
 """
@@ -15,9 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from live.latency import SENT, C, D, Instants, Y
+from live.latency import C, D, Instants, Y
 from live.rows import NEVER, Array, Ints, RecentRows
-from wire.channels import BATCH_NS, SHAPE_POINTS, STATE, columns_of, label
+from wire.channels import (
+    BATCH_NS,
+    DEGRADED,
+    SHAPE_POINTS,
+    STATE,
+    Degraded,
+    Health,
+    columns_of,
+    label,
+)
 from wire.joints import Joints
 from wire.link_latency import MESSAGES, link_kinds, link_latencies
 from wire.messages import PLANT, Batch
@@ -28,7 +38,9 @@ WINDOW_S = 5.0
 STUCK_S = 1.0
 """After so long without a tick of everybody the plant's newest is shown, with what the nodes last said."""
 SLACK_S = 4e-9 * BATCH_NS
-"""A node is on time whose rows are no older than this and two periods: a batch waits a quarter of that."""
+"""What the plant says of the nodes is of now if it is no older than this and two periods: a batch waits a
+quarter of that."""
+_BRIDGED = int(Degraded.FORWARD_BRIDGED | Degraded.BACKWARD_BRIDGED)
 CURVATURE = STATE.index("curvature_per_m")
 METRES, CURVATURES, NUMBERS = 5, 4, 6
 """Decimals of positions, decimals of curvatures, significant digits of errors."""
@@ -47,7 +59,6 @@ class FrameMaker:
         self._instants = Instants(self.rows)
         kinds = link_kinds(run.nodes, run.firsts, frozenset(config.elsewhere))
         self._links = [kind == MESSAGES for kind in kinds]
-        self._elsewhere = np.isin(np.arange(run.nodes), config.elsewhere)
         self._onto_faces = lagrange(np.asarray(run.faces_m) / run.faces_m[-1], SHAPE_POINTS)
         self._weights = np.asarray(run.energy_weights)
         self._firsts: dict[int, Array] = {}
@@ -55,9 +66,11 @@ class FrameMaker:
         plant, root = self.rows.layout[PLANT], self.rows.layout[0]
         self._tip, self._shape = columns_of(plant, "/plant/tip"), columns_of(plant, "/plant/shape")
         self._late = columns_of(plant, "/plant/pace").start
-        self._due, self._began, self._took = (
+        self._health_at = columns_of(plant, "/plant/health")
+        self._passive = columns_of(plant, "/plant/guard", "passive").start
+        self._began, self._took = (
             columns_of(plant, "/sweep/timing", f"{name}_wall_ns").start
-            for name in ("due", "started", "duration")
+            for name in ("started", "duration")
         )
         # before the sums every node's row is the same
         node = f"/node/{label(0, run.nodes)}"
@@ -68,7 +81,14 @@ class FrameMaker:
         self._since = self._counted = NEVER
         self._moved_at = monotonic()
         self._seen = self._late_ticks = 0
-        self._rejected, self._lateness = (np.zeros(run.nodes, dtype=np.int64) for _ in range(2))
+        self._rejected, self._lateness, self._bridged = (
+            np.zeros(run.nodes, dtype=np.int64) for _ in range(3)
+        )
+        self._well = np.full(run.nodes, -1, dtype=np.int64)
+        """What the plant has said of each node in all of the ticks since the last frame."""
+        self._judged = NEVER
+        self._passive_at = NEVER
+        """The newest tick that a frame has shown of a passive arm."""
         self._trouble_at = np.full(run.nodes, -math.inf)
 
     # -- what comes -------------------------------------------------------------------------------
@@ -78,8 +98,13 @@ class FrameMaker:
         if batch.tick == 0:
             self._note_first(batch)
         again = self.rows.begins_again(batch)
-        if not self.rows.add(batch) or batch.sender != PLANT:
+        if not self.rows.add(batch):
             return
+        if batch.sender != PLANT:
+            flags = batch.rows[:, -len(DEGRADED)].astype(np.int64)
+            self._bridged[batch.sender] += np.count_nonzero(flags & _BRIDGED)
+            return
+        self._judge(batch.rows[:, self._health_at].astype(np.int64))
         if again:
             self._sweeps.clear()
             self._since = self._counted = NEVER
@@ -90,6 +115,12 @@ class FrameMaker:
         self._sweeps.append((began, took, batch.tick))
         while self._sweeps[0][0][-1] < began[-1] - 1e9 * WINDOW_S:
             self._sweeps.popleft()
+
+    def _judge(self, health: Ints) -> None:
+        """Take what the plant says of the nodes in some ticks, (ticks, n)."""
+        self._well &= np.bitwise_and.reduce(health, axis=0)
+        self._lateness += np.count_nonzero(~health & int(Health.ON_TIME), axis=0)
+        self._trouble_at[np.any(~health & int(Health.VALID), axis=0)] = monotonic()
 
     def refused(self, sender: int, messages: int = 1) -> None:
         """Telemetry of this sender, or messages to it, were refused."""
@@ -125,9 +156,11 @@ class FrameMaker:
         rows, now = self.rows, monotonic()
         ticks = rows.complete(after=self._since)
         fresh = ticks[ticks > self._counted]
+        passive = rows.newest[-1] != NEVER and bool(rows.of(PLANT, rows.newest[-1])[self._passive])
         if fresh.size:
-            self._count(fresh, now)
             self._counted, self._moved_at = int(fresh[-1]), now
+        elif passive and rows.newest[-1] != self._passive_at:
+            self._passive_at = int(rows.newest[-1])  # the nodes have stopped: nobody waits for them
         elif not running or now - self._moved_at < STUCK_S or rows.newest[-1] == NEVER:
             return None
         if fresh.size:
@@ -145,6 +178,7 @@ class FrameMaker:
             "time_s": round(tick * self._run.tick_s, 6),
             "setpoint": int(own[0][self._setpoint]) if 0 in own else None,
             "late": bool(truth[self._late]),
+            "passive": passive,
             "late_ticks": self._late_ticks,
             "ticks_seen": self._seen,
             "tip": [_metres(x), _metres(y)],
@@ -168,17 +202,6 @@ class FrameMaker:
         if fresh.size and joints is not None:
             frame |= self._apart(np.asarray(joints), shape, {**own, PLANT: truth})
         return frame | self._rates()
-
-    def _count(self, fresh: Ints, now: float) -> None:
-        """Look through ticks that are new for nodes whose commands came after the tick was over."""
-        if self._run.pace is None:
-            return
-        due = self.rows.of(PLANT, fresh)[:, self._due]
-        sent = self._instants.at(fresh)[:, :, SENT]
-        late = (sent > due[:, None] + 1e9 * self._run.pace.period_s).sum(axis=0)
-        late[self._elsewhere] = 0
-        self._lateness += late
-        self._trouble_at[late > 0] = now
 
     def _apart(self, joints: Array, shape: Array, rows: Mapping[int, Array]) -> dict[str, Any]:
         """How far the estimate is from the truth, in m (rms over the joints) and in the energy norm."""
@@ -219,7 +242,8 @@ class FrameMaker:
         }
 
     def _latencies(self, ticks: Ints) -> dict[str, Any]:
-        """Median and longest of each link in microseconds, over the ticks that are here."""
+        """Median and longest of each link in microseconds, over the ticks that are here and whole."""
+        ticks = self._instants.came(ticks)
         unknown: list[float | None] = [None] * (self._run.nodes - 1)
         names = ("forward_us", "forward_most_us", "backward_us", "backward_most_us")
         if not ticks.size:
@@ -239,15 +263,25 @@ class FrameMaker:
         return out
 
     def _health(self, now: float) -> dict[str, Any]:
-        """What can be said of each node by its rows; whether it lives is said by its token."""
-        age = now - self.rows.arrived_s[:-1]
+        """What the plant says of each node, in all of the ticks since the last frame, and its own rows."""
+        rows = self.rows
+        age = now - rows.arrived_s[:-1]
         here = np.isfinite(age)
+        well, self._well = self._well, np.full(self._run.nodes, -1, dtype=np.int64)
+        newest = rows.newest[-1]
+        if newest != NEVER:  # so that a frame without news of the plant says what the last one said
+            well = well & rows.of(PLANT, newest)[self._health_at].astype(np.int64)
+        news = now - rows.arrived_s[-1] <= SLACK_S + 2.0 * self._period_s
+        latest = [rows.last(i) for i in range(self._run.nodes)]
         return {
+            "alive": ((well & int(Health.ALIVE)) != 0).tolist(),
+            "flags": [0 if row is None else int(row[-len(DEGRADED)]) for row in latest],
+            "bridged": self._bridged.tolist(),
             "tick": self.rows.newest[:-1].tolist(),
             "age_s": [
                 round(a, 2) if h else None for a, h in zip(age.tolist(), here.tolist(), strict=True)
             ],
-            "on_time": (age <= SLACK_S + 2.0 * self._period_s).tolist(),
+            "on_time": (news & ((well & int(Health.ON_TIME)) != 0)).tolist(),
             "rejected": self._rejected.tolist(),
             "late": self._lateness.tolist(),
             "valid": (now - self._trouble_at > WINDOW_S).tolist(),

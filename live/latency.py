@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from live.rows import Array, Ints, RecentRows
-from wire.channels import timing_fields
+from wire.channels import DEGRADED, timing_fields
 
 INSTANTS = (
     "measurement_received_wall_ns",
@@ -16,7 +16,7 @@ INSTANTS = (
     "backward_received_wall_ns",
     "command_sent_wall_ns",
 )
-Y, C, D, SENT = range(len(INSTANTS))
+Y, C, D, _ = range(len(INSTANTS))
 
 
 class Instants:
@@ -27,7 +27,13 @@ class Instants:
         self._places: list[tuple[list[int], slice]] = []
         for i in range(rows.nodes):
             fields = timing_fields(i, rows.nodes)
-            self._places.append(([INSTANTS.index(f) for f in fields], slice(-len(fields), None)))
+            columns = slice(-len(fields) - len(DEGRADED), -len(DEGRADED))
+            self._places.append(([INSTANTS.index(f) for f in fields], columns))
+
+    def came(self, ticks: Ints) -> Ints:
+        """Of these ticks those in which all messages came; in others some instants are those of giving up."""
+        flags = [self._rows.of(i, ticks)[:, -len(DEGRADED)] for i in range(self._rows.nodes)]
+        return np.asarray(ticks[~np.any(flags, axis=0)])
 
     def at(self, ticks: Ints) -> Array:
         """(ticks, n, 4) in ns in the order of `INSTANTS`; -inf where a node has no such neighbour."""

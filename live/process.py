@@ -8,6 +8,7 @@ that runs on this machine.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from time import monotonic, monotonic_ns
 from typing import Any
@@ -39,8 +40,9 @@ BATCHES = 8
 DRAIN_S = 0.05
 FIRST_S = 2.0
 """After the start it listens so long even without a page, until it has everybody's first tick."""
-FAREWELL_S = 0.5
-"""For the pages to get the last event."""
+FAREWELL_S = 1.5
+"""For the pages to get the last event, on a busy machine too: they are written to only when nobody else wants
+the core. The launcher ends what still lives after two seconds; a page that does not read holds up the end."""
 NICENESS = 5
 """On top of the process's own, where SCHED_IDLE is not to be had."""
 _encode = msgspec.json.Encoder().encode
@@ -73,6 +75,8 @@ class LiveProcess:
         self._started_s: float | None = None
         self._started_ns: int | None = None
         self._samples: Any = None
+        self._most = BATCHES * (config.run.nodes + 1)
+        """Samples that may wait."""
         self._next_s = 0.0
         self._ended = False
 
@@ -81,7 +85,9 @@ class LiveProcess:
         server = self._serve()
         session = None
         try:
-            session = zsession.open_client(self._config.links.connect, self._given_up)
+            session = zsession.open_client(
+                self._config.links.connect, self._given_up, self._config.links.tls
+            )
             if session is not None:
                 tokens = zsession.watch_tokens(
                     session, self._keys.all_ready, self._alive, self._child.wake
@@ -151,7 +157,8 @@ class LiveProcess:
                 self._tell(state="ending", message=message["message"])
             elif message.get("do") == "finish" and not self._ended:
                 if self._news.watched and self._samples is not None:
-                    self._take_all()
+                    # The last frame is of the last tick, however long that takes on a busy machine.
+                    self._take_all(math.inf)
                     self._show()
                 self._ended = True
                 self._told_alive.difference_update(message["dead"])
@@ -181,7 +188,7 @@ class LiveProcess:
         )
         wanted = started is not None and (self._news.watched or first)
         if wanted and self._samples is None:
-            ring = zsession.newest(BATCHES * (self._config.run.nodes + 1))
+            ring = zsession.newest(self._most)
             self._frames.resume()
             self._samples = session.declare_subscriber(self._keys.all_telemetry, ring)
         elif not wanted:
@@ -193,11 +200,15 @@ class LiveProcess:
             self._samples = None
             self._news.forget("frame")
 
-    def _take_all(self) -> None:
+    def _take_all(self, seconds: float | None = None) -> None:
+        """Read what waits, and not what comes meanwhile, for so long at most; None: while a frame can wait."""
+        seconds = DRAIN_S if seconds is None else seconds
         began = monotonic()
-        while (sample := self._samples.try_recv()) is not None:
+        for _ in range(self._most):
+            if (sample := self._samples.try_recv()) is None:
+                return
             self._take(str(sample.key_expr), bytes(sample.payload))
-            if monotonic() - began > DRAIN_S:
+            if monotonic() - began > seconds:
                 return
 
     def _take(self, key: str, raw: bytes) -> None:

@@ -15,8 +15,9 @@ from pathlib import Path
 
 from node.process import NodeProcess
 from wire.child import Child, name_process
+from wire.config_json import loads
 from wire.errors import ExitCode, OctarmError, UsageError
-from wire.run_config import NodeConfig, loads
+from wire.run_config import NodeConfig
 
 
 def main() -> int:

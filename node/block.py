@@ -14,51 +14,20 @@ from itertools import pairwise
 from math import isfinite
 from struct import Struct
 from time import monotonic_ns
-from typing import Protocol
 
 import numpy as np
 
+from node.bridging import BACKWARD_BRIDGED, BRIDGED, FORWARD_BRIDGED, Bridging
+from node.finite import check_finite, explain, refuse_not_finite
+from node.outlet import Outlet
 from node.row import Batch, Y
 from node.sweep import Array, NodeSweep, Payload, bytes_of
-from wire.channels import BATCH_NS
+from wire.channels import BATCH_NS, Degraded
 from wire.errors import UsageError
-from wire.messages import F8, Reason, RejectedError
+from wire.messages import PARTIAL, Reason, RejectedError
 
 _ONE = Struct("<d")
-_OUTPUT = ("velocity_x", "velocity_y", "strain", "curvature", "command")
-
-
-class NotFiniteError(Exception):
-    """A number that this node computed is not finite; the text names node, tick and field."""
-
-
-class Outlet(Protocol):
-    """Where a block's results go: arrays that it fills, and a word when they are complete.
-
-    All of it must be there when the block is made.
-    """
-
-    forward: Array
-    """The sum to the tip's side; empty at the tip."""
-    backward: Array
-    """The sum to the root's side; empty at the root."""
-    commands: Array
-    """u(k+1) of all segments."""
-
-    def send_forward(self, tick: int, setpoint: int) -> None:
-        """`forward` is complete."""
-
-    def send_backward(self, tick: int, setpoint: int) -> None:
-        """`backward` is complete."""
-
-    def send_commands(self, tick: int, setpoint: int) -> None:
-        """`commands` is complete; it belongs to the tick after this one and its setpoint."""
-
-    def recorded(self, tick: int, rows: Sequence[Array]) -> None:
-        """Rows (ticks, columns) of each segment from this tick on, to keep."""
-
-    def begins(self, tick: int, setpoint: int) -> None:
-        """The tick whose messages are expected now, and its setpoint."""
+_NOT_WHOLE = FORWARD_BRIDGED | int(Degraded.PARTIAL)
 
 
 class SegmentBlock:
@@ -66,8 +35,13 @@ class SegmentBlock:
 
     A segment's row is y (2), xh (4), u, setpoint, bump, c, d, then the instants on the monotonic clock, in
     ns after `epoch_ns` (None: after the first measurement), at which the measurement, c (unless it is the
-    root's), d (unless the tip's) came and the command left. `batch` rows are handed over at once, the first
-    time `first_batch`.
+    root's), d (unless the tip's) came and the command left, then the process's `wire.channels.Degraded`.
+    `batch` rows are handed over at once, the first time `first_batch`.
+
+    A sum that does not come can be bridged: the last one, faded, stands for it, so that after some ticks the
+    arm on that side is taken to be where the reference has it. Whoever is around the block says when
+    (`cut_forward`, `cut_backward`, `close`); from then on that neighbour is not waited for, until a sum of its
+    comes again.
     """
 
     def __init__(
@@ -99,6 +73,7 @@ class SegmentBlock:
         self._inner = tuple(pairwise(sweeps))
         self._backward_inner = tuple((b, a) for a, b in reversed(self._inner))
         self._measuring = tuple((sweep, Y * i) for i, sweep in enumerate(sweeps))
+        self._bridging = Bridging(self._root, self._tip)
         self._unpack_y = Struct(f"<{Y * len(sweeps)}d").unpack
         self._commands = bytes_of(outlet.commands)
         self._setpoints = frozenset(map(float, range(sweeps[0].setpoints)))
@@ -121,11 +96,17 @@ class SegmentBlock:
         self._have_y = False
         self._have_c, self._have_d = self._root.first, self._tip.last
         self._y_ns = self._c_ns = self._d_ns = self.began_ns = 0
+        self._flags = 0
 
     @property
     def setpoint(self) -> int:
         """Index of the setpoint whose factors are in use in this tick."""
         return self._root.setpoint
+
+    @property
+    def setpoints(self) -> int:
+        """How many setpoints there are."""
+        return self._root.setpoints
 
     @property
     def begun(self) -> bool:
@@ -143,6 +124,20 @@ class SegmentBlock:
             out.append(f"backward sum from node {self._tip.index + 1}")
         return out
 
+    @property
+    def bridged(self) -> int:
+        """Sums that did not come in time."""
+        return self._bridging.sums
+
+    @property
+    def bridging_ns(self) -> int:
+        """Since when every tick has had a sum bridged; 0 if the last one had none."""
+        return self._bridging.since_ns
+
+    def bridged_from(self) -> list[str]:
+        """Whose sums are not waited for, in words."""
+        return self._bridging.whose()
+
     # -- what comes -------------------------------------------------------------------------------
 
     def on_measurement(self, values: Payload, at_ns: int) -> None:
@@ -151,11 +146,15 @@ class SegmentBlock:
             raise self._twice()
         y = self._unpack_y(values)
         if not isfinite(sum(y)):
-            _refuse_not_finite("measurement", y)
+            refuse_not_finite("measurement", y)
         for sweep, at in self._measuring:
             sweep.measured(y[at], y[at + 1])
         self._have_y, self._y_ns = True, at_ns
         self.began_ns = self.began_ns or at_ns
+        if self._bridging.cut_forward and not self._have_c:
+            self._bridge_forward(at_ns)
+        if self._bridging.cut_backward and not self._have_d:
+            self._bridge_backward(at_ns)
         if self._have_c:
             self._forward()
         if self._have_d:
@@ -166,13 +165,20 @@ class SegmentBlock:
     def on_forward(self, values: Payload, at_ns: int) -> None:
         """Take c of the first segment from its neighbour; RejectedError as above."""
         if self._have_c:
-            raise self._twice()
+            raise self._no_more("forward", FORWARD_BRIDGED)
         if not self._have_y or self._tip.last:  # else the sum that goes on tells
-            _check_finite("forward sum", values)
-        self._root.row.c[:] = values
+            check_finite("forward sum", values)
+        row = self._root.row
+        last = bytes(row.c)
+        row.c[:] = values
         if self._have_y:
-            self._forward()
+            try:
+                self._forward()
+            except RejectedError:
+                row.c[:] = last  # it will be bridged by what came before, not by this
+                raise
         self._have_c, self._c_ns = True, at_ns
+        self._bridging.cut_forward = False
         self.began_ns = self.began_ns or at_ns
         if self._have_y and self._have_d:
             self._finish()
@@ -181,7 +187,7 @@ class SegmentBlock:
         """Take d of the last segment from its neighbour; RejectedError as above, also for an announced setpoint
         that does not exist."""
         if self._have_d:
-            raise self._twice()
+            raise self._no_more("backward", BACKWARD_BRIDGED)
         (announced,) = _ONE.unpack_from(values, len(values) - 8)
         if announced not in self._setpoints:
             raise RejectedError(
@@ -189,14 +195,106 @@ class SegmentBlock:
                 f"expected one of {len(self._setpoints)} setpoints, got {announced!r}",
             )
         if not self._have_y or self._root.first:
-            _check_finite("backward sum", values)
-        self._tip.row.d[:] = values
+            check_finite("backward sum", values)
+        row = self._tip.row
+        last = bytes(row.d)
+        row.d[:] = values
         if self._have_y:
-            self._backward()
+            try:
+                self._backward()
+            except RejectedError:
+                row.d[:] = last
+                raise
         self._have_d, self._d_ns = True, at_ns
+        self._bridging.cut_backward = False
         self.began_ns = self.began_ns or at_ns
         if self._have_y and self._have_c:
             self._finish()
+
+    # -- what does not come -----------------------------------------------------------------------
+
+    def cut_forward(self, at_ns: int) -> None:
+        """The neighbour towards the root is not waited for, in this tick and until a sum of its comes again."""
+        if self._root.first:
+            return
+        self._bridging.cut_forward = True
+        if self._have_y and not self._have_c:
+            self._bridge_forward(at_ns)
+            self._forward()
+            if self._have_d:
+                self._finish()
+
+    def cut_backward(self, at_ns: int, announced: int | None = None) -> None:
+        """The same of the neighbour towards the tip; `announced`: the next setpoint, if that is known."""
+        if self._tip.last:
+            return
+        self._bridging.cut_backward = True
+        if not self._have_d and announced is not None:
+            self._tip.announce(announced)
+        if self._have_y and not self._have_d:
+            self._bridge_backward(at_ns)
+            self._backward()
+            if self._have_c:
+                self._finish()
+
+    def heard_forward(self) -> None:
+        """A sum of an earlier tick came: the neighbour towards the root is there, and waited for again."""
+        self._bridging.cut_forward = False
+
+    def heard_backward(self) -> None:
+        """The same of the neighbour towards the tip."""
+        self._bridging.cut_backward = False
+
+    def partial(self) -> None:
+        """The forward sum that comes now is not of the whole arm; of no matter if it was bridged before."""
+        if not self._have_c:
+            self._flags |= int(Degraded.PARTIAL)
+
+    def close(self, at_ns: int) -> None:
+        """Give the tick up: what has not come is bridged, nothing more is sent, the command is held."""
+        self._flags |= int(Degraded.HELD)
+        anew = not self._have_y
+        if anew:
+            self._flags |= int(Degraded.MEASUREMENT_HELD)
+            for sweep, _ in self._measuring:
+                sweep.measure_again()
+            self._have_y, self._y_ns = True, at_ns
+        if not self._have_c:
+            self._bridging.cut_forward = True
+            self._bridge_forward(at_ns)
+            self._forward(send=False)
+        elif anew:
+            self._forward(send=False)
+        if not self._have_d:
+            self._bridging.cut_backward = True
+            self._bridge_backward(at_ns)
+            self._backward(send=False)
+        elif anew:
+            self._backward(send=False)
+        self._finish(send=False)
+
+    def join(self, tick: int, setpoint: int, states: Sequence[Array]) -> None:
+        """Begin at a tick, in place of a process that is dead, with these absolute states (5,) of the
+        segments."""
+        for (sweep, _), state in zip(self._measuring, states, strict=True):
+            sweep.join(tick, setpoint, state)
+        self.tick = tick
+        self._clear()
+        self._bridging.setpoint = setpoint
+        self._flags = int(Degraded.JOINED)
+        self._outlet.begins(tick, setpoint)
+
+    def deviations(self) -> tuple[Array, Array]:
+        """State less reference, (5,), of the first and of the last segment, in the tick that has begun."""
+        return self._root.row.state.copy(), self._tip.row.state.copy()
+
+    def _bridge_forward(self, at_ns: int) -> None:
+        self._flags |= self._bridging.forward(self.setpoint)
+        self._have_c, self._c_ns = True, at_ns
+
+    def _bridge_backward(self, at_ns: int) -> None:
+        self._flags |= self._bridging.backward(self.setpoint)
+        self._have_d, self._d_ns = True, at_ns
 
     def skip_to(self, tick: int) -> None:
         """Nothing of this tick will come, the next is `tick`: the ticks between had no sweep."""
@@ -209,7 +307,7 @@ class SegmentBlock:
 
     # -- what goes --------------------------------------------------------------------------------
 
-    def _forward(self) -> None:
+    def _forward(self, *, send: bool = True) -> None:
         """The sums to the tip's side, through all segments and on."""
         for sweep, following in self._inner:
             following.take_forward(sweep.forward_sum())
@@ -219,10 +317,12 @@ class SegmentBlock:
             last.forward_sum()
             # a product with ones is the quickest sum of a short array; what is not finite stays so in products
             if not isfinite(self._total_forward(self._forward_out)):
-                self._explain(self._forward_out, "forward sum", self._root.row.c, last)
-            self._send_forward(self.tick, last.setpoint)
+                explain(self.tick, self._forward_out, "forward sum", self._root.row.c, last)
+            if send:
+                partial = PARTIAL if self._flags & _NOT_WHOLE else 0
+                self._send_forward(self.tick, last.setpoint | partial)
 
-    def _backward(self) -> None:
+    def _backward(self, *, send: bool = True) -> None:
         """The sums to the root's side, through all segments and on."""
         for sweep, following in self._backward_inner:
             following.take_backward(sweep.backward_sum())
@@ -231,17 +331,23 @@ class SegmentBlock:
         if not first.first:
             first.backward_sum()
             if not isfinite(self._total_backward(self._backward_out)):
-                self._explain(self._backward_out, "backward sum", self._tip.row.d, first)
-            self._send_backward(self.tick, first.setpoint)
+                explain(self.tick, self._backward_out, "backward sum", self._tip.row.d, first)
+            if send:
+                self._send_backward(self.tick, first.setpoint)
 
-    def _finish(self) -> None:
+    def _finish(self, *, send: bool = True) -> None:
         """Commands of the next tick, records of this one, and the next tick begins."""
+        flags, setpoint = self._flags, self.setpoint
+        self._tip.partial = bool(flags & _NOT_WHOLE)
         for sweep, _, at in self._finishing:
             deviation = sweep.finish()
             if not isfinite(sum(deviation)):
-                self._explain(np.array(deviation), "estimate or command", b"", sweep)
+                explain(self.tick, np.array(deviation), "estimate or command", b"", sweep)
+            if not send:
+                sweep.hold()
             _ONE.pack_into(self._commands, at, sweep.next_command)
-        self._send_commands(self.tick, self._root.next_setpoint)
+        if send:
+            self._send_commands(self.tick, self._root.next_setpoint)
         self.ended_ns = sent_ns = monotonic_ns()
         epoch = self._epoch_ns
         if epoch is None:  # another machine's clock
@@ -255,13 +361,19 @@ class SegmentBlock:
         for sweep, batch, _ in self._finishing:
             row = sweep.row
             if sweep.first:
-                row.instants.pack_into(row.buffer, row.instants_at, y, d, sent)
+                row.instants.pack_into(row.buffer, row.instants_at, y, d, sent, flags)
             elif sweep.last:
-                row.instants.pack_into(row.buffer, row.instants_at, y, c, sent)
+                row.instants.pack_into(row.buffer, row.instants_at, y, c, sent, flags)
             else:
-                row.instants.pack_into(row.buffer, row.instants_at, y, c, d, sent)
+                row.instants.pack_into(row.buffer, row.instants_at, y, c, d, sent, flags)
             batch.keep(sweep.reference)
             sweep.advance()
+        bridging = self._bridging
+        bridging.setpoint = setpoint
+        if flags & BRIDGED:
+            bridging.since_ns = bridging.since_ns or self._y_ns
+        else:
+            bridging.since_ns = 0
         if not self._filled:
             self._batch_began_ns = sent_ns
         self._filled += 1
@@ -288,16 +400,12 @@ class SegmentBlock:
     def _twice(self) -> RejectedError:
         return RejectedError(Reason.DUPLICATE, f"tick {self.tick} has it already")
 
-    def _explain(self, numbers: Array, field: str, came: Payload, sweep: NodeSweep) -> None:
-        """A total is not finite: refuse what came, or fail for what was made of it; or it only overflowed."""
-        _check_finite(field, came)
-        wrong = np.flatnonzero(~np.isfinite(numbers))
-        if wrong.size:
-            at = int(wrong[0])
-            name = _OUTPUT[at] if field.startswith("estimate") else f"{field}[{at}]"
-            raise NotFiniteError(
-                f"tick {self.tick}: node {sweep.index} computed {name} = {float(numbers[at])}"
-            )
+    def _no_more(self, which: str, bridged: int) -> RejectedError:
+        """A sum of this tick is not wanted any more: it was bridged, or is here already."""
+        if not self._flags & bridged:
+            return self._twice()
+        self.heard_forward() if bridged == FORWARD_BRIDGED else self.heard_backward()
+        return RejectedError(Reason.LATE, f"the {which} sum of tick {self.tick} was bridged")
 
 
 def _check_chain(sweeps: Sequence[NodeSweep]) -> None:
@@ -309,15 +417,3 @@ def _check_chain(sweeps: Sequence[NodeSweep]) -> None:
                 f"segments {a.index} and {b.index} of one process are not neighbours of one "
                 "deployment; deploy the gains again"
             )
-
-
-def _check_finite(field: str, values: Payload) -> None:
-    numbers = np.frombuffer(values, F8).tolist()
-    if not isfinite(sum(numbers)):
-        _refuse_not_finite(field, numbers)
-
-
-def _refuse_not_finite(field: str, values: Sequence[float]) -> None:
-    for at, value in enumerate(values):
-        if not isfinite(value):
-            raise RejectedError(Reason.NOT_FINITE, f"{field}[{at}] is {value}")

@@ -9,6 +9,7 @@ tick has left.
 from __future__ import annotations
 
 import gc
+import math
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -16,22 +17,26 @@ from threading import Lock
 from time import monotonic_ns
 from typing import Any
 
-from node.block import NotFiniteError, SegmentBlock
+from node.block import SegmentBlock
 from node.configured import sweeps_of
+from node.finite import NotFiniteError
+from node.neighbours import Neighbours
+from node.receiving import Others
 from node.row import Y
-from node.sweep import Array, payload
+from node.sweep import Array
 from wire import session as zsession
-from wire.child import Child, Deadline
+from wire.child import Child, Deadline, remove_sockets
 from wire.counters import Flow, Rejections
 from wire.errors import ExitCode
+from wire.gate import Gate
 from wire.keys import Keys
+from wire.limits import check_files
 from wire.messages import (
     HEADER_BYTES,
     PLANT,
     Incoming,
     Kind,
     Outgoing,
-    Reason,
     RejectedError,
     Stop,
     decode_stop,
@@ -62,6 +67,7 @@ class NodeProcess:
         self._lock = Lock()
         self._stop: Stop | None = None
         self._failure: tuple[str, str] | None = None
+        self._leaving = False
         names = ("measurement", "command", "forward", "backward")
         self._received = {name: Flow() for name in names}
         self._sent = {name: Flow() for name in names}
@@ -92,6 +98,7 @@ class NodeProcess:
         self.send_forward = self._sender("forward")
         self.send_backward = self._sender("backward")
         self.send_commands = self._sender("command")
+        self._linked = False
         self._block = SegmentBlock(
             sweeps,
             self,
@@ -100,22 +107,32 @@ class NodeProcess:
             first_batch=1 + (config.index * (config.batch_ticks - 1)) // config.nodes,
             epoch_ns=config.links.epoch_ns,
         )
+        self._neighbours = Neighbours(config, self._keys, sweeps, self._block, self._lock)
+        self._linked = True
+        self._others = Others(config, self._block, self._neighbours, child)
 
     def run(self) -> ExitCode:
         """Link up, take part in every tick, report, and leave; returns the exit code."""
         config = self._config
         place(config.links.cpu, config.links.fifo, self._note)
-        session = zsession.open_session("peer", config.links.listen, config.links.connect)
+        if config.joins:
+            remove_sockets(list(config.links.listen))  # the dead process's
+        gate = Gate("peer", config.links, self._child)
+        session = gate.session
         try:
             self._declare(session)
-            token = self._link(session)
-            if token is not None:
+            if self._link():
                 step_back(config.links.fifo)
-                self._attend()
+                token = self._present(session)
+                self._attend(token)
+                del token
         finally:
+            with self._lock:  # nobody is in the middle of sending
+                self._leaving = True
+            self._neighbours.close()
             self._publishers.clear()
             self._subscribers.clear()
-            session.close()
+            gate.close()
         return ExitCode.SAFETY_STOP if self._failure else ExitCode.OK
 
     # -- links ------------------------------------------------------------------------------------
@@ -141,6 +158,12 @@ class NodeProcess:
         )
         for name, key in control.items():
             self._publishers[name] = zsession.control_publisher(session, key)
+        self._subscribers += self._neighbours.declare(
+            session,
+            lambda: not (self._stop or self._failure or self._leaving),
+            lambda error: self._rejections.add(error.reason),
+            self._block.setpoints,
+        )
         self._publishers["telemetry"] = zsession.telemetry_publisher(session, keys.telemetry(first))
         for publisher in self._publishers.values():
             listener = publisher.declare_matching_listener(
@@ -148,9 +171,8 @@ class NodeProcess:
             )
             self._subscribers.append(listener)
 
-    def _link(self, session: Any) -> Any | None:
-        """Wait until every publisher has its subscriber; returns the liveliness token, None if
-        stopped."""
+    def _link(self) -> bool:
+        """Wait until every publisher has its subscriber; False if stopped before."""
         index = self._config.index
         far = {
             "command": "the plant",
@@ -160,23 +182,33 @@ class NodeProcess:
         }
         told: list[str] | None = None
         while not self._child.stopping:
+            check_files()
             missing = [far[n] for n, p in self._publishers.items() if not zsession.matched(p)]
             if missing != told:
                 self._child.status("waiting", missing=missing)
                 told = missing
             if not missing:
-                token = session.liveliness().declare_token(self._keys.ready(index))
                 self._child.status("ready")
                 gc.collect()
                 gc.freeze()
                 gc.disable()
-                return token
+                return True
             self._child.wait(1.0)
-        return None
+        return False
+
+    def _present(self, session: Any) -> Any | None:
+        """Say that this node is part of the chain, by a token to be kept; one that replaces a dead node waits
+        until it is, None if it is stopped before."""
+        while self._neighbours.joining is not None:
+            if self._stop or self._failure or self._child.stopping:
+                return None
+            self._child.wait(1.0)
+        self._neighbours.joined()
+        return session.liveliness().declare_token(self._keys.ready(self._config.index))
 
     # -- the run ----------------------------------------------------------------------------------
 
-    def _attend(self) -> None:
+    def _attend(self, token: Any | None) -> None:
         """Main thread: until stopped, send the records on and see that no tick exceeds its deadline."""
         limit_s = self._config.links.deadline_s
         while not (self._stop or self._failure or self._child.stopping):
@@ -187,14 +219,21 @@ class NodeProcess:
                 left = PLANT_PATIENCE * limit_s - (monotonic_ns() - ended) * 1e-9
             else:
                 left = limit_s  # the first measurement comes when the launcher says so
+            bridge_left = self._bridge_left_s()
             if left <= 0.0:
                 self._late(began)
+            elif bridge_left <= 0.0:
+                self._unheard()
             else:
-                self._child.wait(left)
+                self._child.wait(min(left, bridge_left))
             self._send_batches()
         if self._failure:
             code, text = self._failure
             self._child.status("failed", code=code, message=text, tick=self._block.tick)
+            if (
+                token is not None and not self._supervised
+            ):  # nobody reads that line: this the plant sees
+                token.undeclare()
             # The plant answers with its order to stop; without one the launcher's signal comes.
             patience = Deadline(limit_s)
             while not (self._stop or self._child.stopping or patience.passed):
@@ -215,6 +254,21 @@ class NodeProcess:
             "deadline",
             f"tick {tick}: node {self._config.index} waited {limit_s:g} s "
             f"for {' and '.join(missing)}",
+        )
+
+    def _bridge_left_s(self) -> float:
+        """How long a neighbour's sums may still be bridged."""
+        since, limit_s = self._block.bridging_ns, self._config.bridge_s
+        return limit_s - (monotonic_ns() - since) * 1e-9 if since and limit_s else math.inf
+
+    def _unheard(self) -> None:
+        """A link is broken though everybody lives, or a dead neighbour is not replaced: the arm must not be
+        controlled in two halves for long."""
+        ways = self._block.bridged_from()
+        self._failure = (
+            "bridged",
+            f"tick {self._block.tick}: node {self._config.index} has had no {' and no '.join(ways)} for "
+            f"{self._config.bridge_s:g} s",
         )
 
     def _report(self) -> None:
@@ -244,6 +298,7 @@ class NodeProcess:
         first |= sent["backward"].report("backward_sent")
         last |= received["backward"].report("backward_received")
         last |= sent["forward"].report("forward_sent")
+        first["bridged_sums"] = self._block.bridged
         first |= self._telemetry.report("telemetry_sent") | self._rejections.report()
         return out
 
@@ -267,36 +322,25 @@ class NodeProcess:
             at_ns = monotonic_ns()
             try:
                 with lock:
-                    if raw.startswith(incoming.header) and len(raw) == incoming.size:
+                    if self._neighbours.joining is not None:
+                        if not self._others.begin(name, incoming.decode(raw), at_ns):
+                            return
+                    elif raw.startswith(incoming.header) and len(raw) == incoming.size:
                         take(raw[HEADER_BYTES:], at_ns)
                     else:
-                        take(self._another(incoming, raw), at_ns)
+                        take(self._others.take(name, incoming.decode(raw), at_ns), at_ns)
                 note(raw)
             except RejectedError as error:
                 self._rejections.add(error.reason)
             except NotFiniteError as error:
                 self._fail("not finite", str(error))
             except Exception as error:
+                if self._leaving:  # a last message, and nothing to answer it with any more
+                    return
                 traceback.print_exc()
                 self._fail("internal", f"node {self._config.index}: {error!r}")
 
         return receive
-
-    def _another(self, incoming: Incoming, raw: bytes) -> bytes:
-        """A message that is not the one that is due: refused by name, unless a tick was left out."""
-        message, block = incoming.decode(raw), self._block
-        ahead = message.tick - block.tick
-        skips = 0 < ahead <= self._config.skip_ticks and not block.begun
-        if ahead and not skips:
-            reason = Reason.STALE if ahead < 0 else Reason.EARLY
-            raise RejectedError(reason, f"expected tick {block.tick}, got {message.tick}")
-        if message.setpoint != block.setpoint:
-            raise RejectedError(
-                Reason.SETPOINT, f"expected {block.setpoint}, got {message.setpoint}"
-            )
-        if skips:
-            block.skip_to(message.tick)
-        return payload(message.values)
 
     def _fail(self, code: str, text: str) -> None:
         self._failure = self._failure or (code, text)
@@ -324,6 +368,8 @@ class NodeProcess:
     def begins(self, tick: int, setpoint: int) -> None:
         """Know the messages of this tick beforehand."""
         Incoming.expect_all(self._all_incoming, tick, setpoint)
+        if self._linked and self._neighbours.asking:
+            self._neighbours.tell(tick, setpoint)
 
     def recorded(self, tick: int, rows: Sequence[Array]) -> None:
         """Leave a batch to the main thread: nothing on the way of a tick waits for it."""

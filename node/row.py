@@ -13,7 +13,7 @@ from struct import Struct
 import numpy as np
 import numpy.typing as npt
 
-from wire.channels import MEASUREMENT, SCHEDULE
+from wire.channels import DEGRADED, MEASUREMENT, SCHEDULE
 from wire.factors import BACKWARD_EXTRA, FORWARD_EXTRA, INPUTS, OUTPUTS
 
 Array = npt.NDArray[np.float64]
@@ -22,7 +22,8 @@ Y = len(MEASUREMENT)
 Y_PAIR = Struct("<2d")
 KNOWN = Struct("<4d")
 """The measurement as it came, and the schedule."""
-_INSTANTS = {count: Struct(f"<{count}d") for count in (0, 3, 4)}
+_INSTANTS = {count: Struct(f"<{count + 1}d") for count in (0, 3, 4)}
+"""So many instants, then the tick's `wire.channels.Degraded`."""
 
 
 class TickRow:
@@ -53,7 +54,7 @@ class TickRow:
 
     def __init__(self, forward: int, backward: int, instants: int = 0) -> None:
         middle, end = forward + INPUTS, forward + INPUTS + backward
-        row = self._array = np.zeros(end + Y + len(SCHEDULE) + instants)
+        row = self._array = np.zeros(end + Y + len(SCHEDULE) + instants + len(DEGRADED))
         self._forward, self._backward = forward, backward
         self.of_forward, self.of_backward, self.of_output = (
             row[:middle],

@@ -122,7 +122,10 @@ class NodeSweep:
         self._sectors = sectors or Sectors.only(setpoint)
         self._tip = CLAMP
         self._changed = False
-        self._fade = fade
+        self.fade = fade
+        """Factor a tick of the bump, and of a sum that does not come."""
+        self.partial = False
+        """Whether the forward sum of this tick is not of the whole arm: then the tip node decides nothing."""
         self._next_bump = 0.0
         self._so_far_at = 8 * (self.forward_received - FORWARD_EXTRA)
         self._announced_at = 8 * (self.backward_received - BACKWARD_EXTRA)
@@ -130,6 +133,7 @@ class NodeSweep:
         instants = 2 + (not self.first) + (not self.last)
         self.row = TickRow(self.forward_received, self.backward_received, instants)
         """Where the ticks happen."""
+        self._stays(setpoint)
         self._next = np.zeros(OUTPUTS)
         self._next_bytes = bytes_of(self._next)
         self._absolute = np.zeros(0)
@@ -142,6 +146,7 @@ class NodeSweep:
                 f"{self.reference.size}; deploy the gains again"
             )
         self._aim()
+        self._measured_nothing()
         start = [*factors.initial_estimate[setpoint], factors.initial_command[setpoint]]
         self.row.state[:] = np.array(start) - self.reference[:OUTPUTS]
         self._own()
@@ -244,7 +249,7 @@ class NodeSweep:
         if self._changed:
             self._next_bump = float(row.state[STATES]) - out[STATES]
         else:
-            self._next_bump = self.bump * self._fade
+            self._next_bump = self.bump * self.fade
         if self._next_bump:
             out[STATES] += self._next_bump
             state[STATES] = out[STATES]
@@ -271,8 +276,65 @@ class NodeSweep:
         self._changed = self._announced != self._setpoint
         if self._changed:
             self.select(self._announced)
-        if self.last:
+        if self.last and not self.partial:
             self._decided = self._sectors.choose(self._decided, self._tip)
+
+    # -- what did not come ------------------------------------------------------------------------
+
+    def measure_again(self) -> None:
+        """The measurement did not come: the last one stands for it."""
+        row = self.row
+        velocity, curvature, *_ = KNOWN.unpack_from(row.buffer, row.known_at)
+        self.measured(velocity, curvature)
+
+    def fade_forward(self, factor: float) -> None:
+        """The sum from the root's side did not come: the last one, times a factor, stands for it.
+
+        With zero the arm on that side is taken to be where the reference has it. What the scheduling added to
+        the sum stays.
+        """
+        self.row.of_forward[: max(0, self.forward_received - FORWARD_EXTRA)] *= factor
+
+    def fade_backward(self, factor: float) -> None:
+        """The same of the sum from the tip's side."""
+        row = self.row
+        row.of_output[row.of_output.size - self.backward_received :][:-BACKWARD_EXTRA] *= factor
+
+    def announce(self, setpoint: int) -> None:
+        """Put the next setpoint where the sum from the tip's side has it."""
+        _ONE.pack_into(self.row.d, self._announced_at, setpoint)
+
+    def hold(self) -> None:
+        """After `finish`: the command of this tick is that of the next as well."""
+        held = float(self.row.state[STATES]) + float(self.reference[STATES] - self._then[STATES])
+        self._next[STATES] = self._next_state[STATES] = held
+        self._next_bump = self.bump
+        self.next_command = held + self._then_command
+
+    def guess(self, tick: int, deviation: Array) -> Array:
+        """An absolute state (5,) near the reference of a tick plus a deviation (5,), from which `join` finds
+        again exactly the deviation that it is recorded with."""
+        wanted = self._reference.at(tick)[:OUTPUTS]
+        state: Array = wanted + deviation
+        for _ in range(4):
+            again = (state - wanted) + wanted
+            if np.array_equal(again, state):
+                return state
+            state = again
+        return np.asarray(wanted.copy())
+
+    def join(self, tick: int, setpoint: int, state: Array) -> None:
+        """Begin anew at a tick, with this absolute state (5,) and the gains of this setpoint."""
+        self.tick, self.bump = tick, 0.0
+        self.select(setpoint)
+        self._decided = self._announced = setpoint
+        self._stays(setpoint)
+        self._changed = False
+        self.reference, self._then = self._reference.at(tick), self._reference.at(tick + 1)
+        self._aim()
+        self.row.state[:] = state - self.reference[:OUTPUTS]
+        self._measured_nothing()
+        self._own()
 
     def skip_to(self, tick: int) -> None:
         """Ticks have passed without a sweep: the estimate keeps its deviation from the reference, the command
@@ -326,6 +388,18 @@ class NodeSweep:
         self.advance()
 
     # -- parts ------------------------------------------------------------------------------------
+
+    def _stays(self, setpoint: int) -> None:
+        """Until the first sum from the tip's side comes, the next setpoint is the one in use."""
+        if not self.last:
+            self.announce(setpoint)
+
+    def _measured_nothing(self) -> None:
+        """Until the first measurement comes, the last one is what the reference says."""
+        row = self.row
+        KNOWN.pack_into(row.buffer, row.known_at, *self._wanted, self._setpoint, self.bump)
+        if not self.last:  # and the setpoint is not about to change
+            self.announce(self._setpoint)
 
     def _aim(self) -> None:
         """The references of this tick and the next, in pieces."""

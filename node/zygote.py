@@ -11,15 +11,12 @@ from __future__ import annotations
 # Everything a node needs is loaded here, before the first fork.
 from node.process import NodeProcess
 from wire.child import Child, Deadline, die_with_parent, name_process
-from wire.errors import OctarmError
 from wire.forking import Nursery, life
-from wire.run_config import NodeConfig, loads
+from wire.run_config import NodeConfig
 
 SILENCE_S = 30.0
 """A remote launcher writes an empty line more often than this (supervise.far); without one it is lost,
 though nobody has closed the pipe."""
-DYING_S = 1.0
-"""A launcher of many threads takes less than this to die."""
 
 
 def serve(parent: int | None, *, directory: str | None = None) -> int:
@@ -29,7 +26,7 @@ def serve(parent: int | None, *, directory: str | None = None) -> int:
     are forked here, removed if the launcher dies.
     """
     if parent is not None:
-        die_with_parent(parent)
+        die_with_parent(parent, directory)
     name_process("octarm-zygote")
     child = Child("zygote", control=0, status=1, directory=directory)
     nursery = Nursery(child)
@@ -42,32 +39,11 @@ def serve(parent: int | None, *, directory: str | None = None) -> int:
             break
         for line in lines:
             if line and not child.stopping:
-                _birth(line, child, nursery)
+                nursery.birth(line, NodeConfig, "node configuration", run_node)
         nursery.reap()
     nursery.end()
-    if directory is not None:
-        _leave(child)
-    return 0
-
-
-def _leave(child: Child) -> None:
-    """Remove the private directory if the launcher is dead.
-
-    The signal of its death comes when its first thread is gone: its lifeline ends with the last one.
-    """
-    patience = Deadline(DYING_S)
-    while not (child.orphaned or patience.passed):
-        child.wait_lines(patience.left)
     child.leave([])
-
-
-def _birth(line: bytes, child: Child, nursery: Nursery) -> None:
-    try:
-        config = loads(NodeConfig, line, "node configuration")
-    except OctarmError as error:
-        child.status("failed", code="configuration", message=str(error))
-        return
-    nursery.fork(config.index, lambda own: run_node(config, own))
+    return 0
 
 
 def run_node(config: NodeConfig, parent: int) -> int:

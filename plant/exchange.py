@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from wire import session as zsession
-from wire.channels import MEASUREMENT
+from wire.channels import MEASUREMENT, WELL, Health
 from wire.counters import Flow, Rejections
 from wire.keys import Keys
 from wire.messages import (
@@ -33,6 +33,10 @@ from wire.messages import (
 
 Array = npt.NDArray[np.float64]
 Y = len(MEASUREMENT)
+DISAGREE_TICKS = 20
+"""After a gap in the chain its two sides may use different setpoints' gains for some ticks; not for longer."""
+_LATE = (Reason.STALE, Reason.EARLY)
+"""Refused for their time alone: what they say is valid."""
 
 
 class Exchange:
@@ -46,8 +50,25 @@ class Exchange:
         setpoints: int,
         setpoint: int,
         complete: Callable[[], None],
+        *,
+        lenient: bool = False,
     ) -> None:
-        """`commands` are u(0) of all segments; `complete` is called (on Zenoh's thread) when all have come."""
+        """`commands` are u(0) of all segments; `complete` is called (on Zenoh's thread) when all have come.
+
+        lenient: nodes that do not agree about the next setpoint are given time to.
+        """
+        self._lenient = lenient
+        self._patience = DISAGREE_TICKS if lenient else 0
+        self.disagreeing = 0
+        """Ticks in a row in which the nodes did not agree about the next setpoint."""
+        self.vanished: set[int] = set()
+        """Nodes whose token was there and is not any more; filled by whoever watches the tokens."""
+        self._out: set[int] = set()
+        self._back: set[int] = set()
+        """Places in the order of `firsts`: not waited for, and waited for again from the next tick on."""
+        self._refused: set[int] = set()
+        self._missed: set[int] = set()
+        """Places that were waited for in the tick before and whose command did not come."""
         self._firsts = tuple(firsts)
         self._slices = [slice(a, b) for a, b in pairwise([*firsts, len(commands)])]
         self._keys = keys
@@ -100,13 +121,17 @@ class Exchange:
     def send(self, tick: int, measured: Array) -> int:
         """Send y(tick), (segments, 2), and begin to collect; returns the instant of the first one, ns."""
         messages = []
-        for outgoing, own in zip(self._outgoing, self._slices, strict=True):
+        for outgoing, own, said in zip(self._outgoing, self._slices, self._said, strict=True):
             outgoing.values[:] = measured[own].ravel()
-            messages.append(outgoing.stamped(tick, self.setpoint))
+            messages.append(outgoing.stamped(tick, said))
         with self._lock:
+            self._missed = {p for p, have in enumerate(self._have) if not have} - self._out
+            self._out -= self._back
+            self._back.clear()
+            self._refused.clear()
             self.tick = tick
             self._have = [False] * len(self._firsts)
-            self.left = len(self._firsts)
+            self.left = len(self._firsts) - len(self._out)
             for incoming, said in zip(self._incoming, self._said, strict=True):
                 incoming.expect(tick, said)
         started_ns = monotonic_ns()
@@ -122,22 +147,78 @@ class Exchange:
 
     @property
     def said_first(self) -> int:
-        """The next setpoint according to the first node."""
-        return self._said[0]
+        """The next setpoint according to the first node that is waited for."""
+        return self._said[next((p for p in range(len(self._said)) if p not in self._out), 0)]
 
     def missing(self) -> list[int]:
-        """Nodes whose command of this tick has not come."""
-        return [i for i, have in zip(self._firsts, self._have, strict=True) if not have]
+        """Nodes that are waited for and whose command of this tick has not come."""
+        return [
+            node
+            for place, node in enumerate(self._firsts)
+            if not self._have[place] and place not in self._out
+        ]
 
-    def take(self) -> tuple[list[int], int] | None:
-        """Make the set that has come the commands that count; or tell who disagrees with the first node about
-        the next setpoint, and what they say."""
-        said = self._said[0]
-        other = [i for i, one in zip(self._firsts, self._said, strict=True) if one != said]
-        if other:
+    def stuck(self) -> list[int]:
+        """Those that are missing again: in this tick and in the one before; if there are none, those that are
+        missing. Who was late once is not stuck, and has not to be replaced because somebody else is."""
+        missing = self.missing()
+        return [node for node in missing if self._firsts.index(node) in self._missed] or missing
+
+    @property
+    def out(self) -> list[int]:
+        """Nodes that are not waited for."""
+        return [self._firsts[place] for place in sorted(self._out)]
+
+    def give_up(self, node: int) -> None:
+        """Do not wait for a node, in this tick and until a command of its comes again."""
+        place = self._firsts.index(node)
+        with self._lock:
+            if place in self._out:
+                return
+            self._out.add(place)
+            self._back.discard(place)
+            if not self._have[place] and self.left:
+                self.left -= 1
+                if not self.left:
+                    self.complete_ns = monotonic_ns()
+
+    def health(self) -> list[int]:
+        """Per segment wire.channels.Health as it is now."""
+        out = []
+        for place, (node, own) in enumerate(zip(self._firsts, self._slices, strict=True)):
+            health = WELL
+            if node in self.vanished:
+                health &= ~int(Health.ALIVE)
+            if not self._have[place]:
+                health &= ~int(Health.ON_TIME)
+            if place in self._refused:
+                health &= ~int(Health.VALID)
+            out += [health] * (own.stop - own.start)
+        return out
+
+    def take(self, rest: Array | None = None, fade: float = 0.0) -> tuple[list[int], int] | None:
+        """Make what has come the commands that count; or tell who disagrees with the first node about the next
+        setpoint, and what they say.
+
+        Of a node that is late the last command is held; that of one that is not waited for goes to `rest`
+        (segments,), N/m: its difference from that is multiplied by `fade`.
+        """
+        said = self.said_first
+        other = [
+            node
+            for place, node in enumerate(self._firsts)
+            if place not in self._out and self._said[place] != said
+        ]
+        self.disagreeing = self.disagreeing + 1 if other else 0
+        if other and self.disagreeing > self._patience:
             return other, self._said[self._firsts.index(other[0])]
         self.setpoint = said
-        np.copyto(self.commands, self._coming)
+        with self._lock:
+            for place in self._out:
+                if not self._have[place] and rest is not None:
+                    own = self._slices[place]
+                    self._coming[own] = rest[own] + fade * (self._coming[own] - rest[own])
+            np.copyto(self.commands, self._coming)
         return None
 
     def settle(self) -> None:
@@ -167,16 +248,22 @@ class Exchange:
                 with self._lock:
                     due = incoming.due(raw) and not self._have[place]
                     values = numbers_of(raw) if due else self._other(raw, place)
+                    _check_finite(values)
                     self._coming[own] = values
-                    _check_finite(self._coming[own])
                     self._have[place] = True
                     flow.add(raw)
+                    if place in self._out:
+                        self._back.add(place)
+                        self.vanished.discard(self._firsts[place])
+                        return
                     done = self.left == 1
                     if done:
                         self.complete_ns = monotonic_ns()
                     self.left -= 1
             except RejectedError as error:
                 self._rejections.add(error.reason)
+                if error.reason not in _LATE:
+                    self._refused.add(place)
                 return
             except Exception:
                 traceback.print_exc()
@@ -190,6 +277,9 @@ class Exchange:
         """A command that is not quite the expected one: of another setpoint, or refused by name."""
         message: Numbers = self._incoming[place].decode(raw)
         if message.tick != self.tick:
+            if self._lenient and place in self._out and message.tick == self.tick - 1:
+                self._back.add(place)  # not far behind: in the next tick it is there
+                self.vanished.discard(self._firsts[place])
             reason = Reason.STALE if message.tick < self.tick else Reason.EARLY
             raise RejectedError(reason, f"expected tick {self.tick}, got {message.tick}")
         if self._have[place]:
@@ -201,6 +291,6 @@ class Exchange:
         return message.values
 
 
-def _check_finite(values: Array) -> None:
+def _check_finite(values: Array | list[float]) -> None:
     if not np.isfinite(values).all():
-        raise RejectedError(Reason.NOT_FINITE, f"got {values.tolist()}")
+        raise RejectedError(Reason.NOT_FINITE, f"got {list(values)}")

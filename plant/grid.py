@@ -14,35 +14,49 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from wire.errors import UsageError
+from wire.errors import UsageError, shown
 
 Array = npt.NDArray[np.float64]
 
 CELLS_PER_SEGMENT = 4
 """The plant's grid is at least this much finer than the controller's (theory, section 6)."""
 FEWEST_DEFAULT_CELLS = 40
+CHAPTER_CELLS = 10
+"""The grid of the source chapter (its section 4.1)."""
+MOST_CHAPTER_CELLS = 400
+"""All eigenvalues of its matrices are asked for."""
 MOST_CELLS = 4000
 """Matrices of the grid have the square of it numbers, and substeps shrink with its square."""
 _STENCIL = 4  # samples in one interpolation: local cubic polynomials
 
 
-def plant_cells(segments: int, asked: int | None = None) -> int:
+def plant_cells(segments: int, asked: int | None = None, *, exact: bool = True) -> int:
     """Number of cells of the plant's grid for a number of segments.
 
     Without `asked` it is max(40, 4 segments). Raises UsageError if fewer than 4 cells a segment are
     asked for (the plant would then share the controller's discretisation error and prove nothing
-    about it), or more than `MOST_CELLS`.
+    about it), or more than `MOST_CELLS`. The source chapter's models (not `exact`) are for its own grid of
+    10 cells, or one a segment if there are more segments, and take 4 to `MOST_CHAPTER_CELLS`.
     """
+    if not exact:
+        if asked is None:
+            return min(max(CHAPTER_CELLS, segments), MOST_CHAPTER_CELLS)
+        if not _STENCIL <= asked <= MOST_CHAPTER_CELLS:
+            raise UsageError(
+                f"plant cells: expected {_STENCIL}..{MOST_CHAPTER_CELLS} for the chapter's models, got "
+                f"{shown(asked)}"
+            )
+        return asked
     fewest = max(_STENCIL, CELLS_PER_SEGMENT * segments)
     if asked is None:
         return max(FEWEST_DEFAULT_CELLS, fewest)
     if asked < fewest:
         raise UsageError(
             f"plant cells: expected at least {fewest} ({CELLS_PER_SEGMENT} for each of the "
-            f"{segments} segments), got {asked}; ask for more cells or fewer segments"
+            f"{segments} segments), got {shown(asked)}; ask for more cells or fewer segments"
         )
     if asked > MOST_CELLS:
-        raise UsageError(f"plant cells: expected at most {MOST_CELLS}, got {asked}")
+        raise UsageError(f"plant cells: expected at most {MOST_CELLS}, got {shown(asked)}")
     return asked
 
 

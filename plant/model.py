@@ -20,6 +20,7 @@ from plant.disturbance import NO_DISTURBANCE, Disturbance, DisturbanceSpec, make
 from plant.elastic import ElasticForce, elastic_energy, rest_shape, strains
 from plant.grid import Grid, check_faces, interpolation_matrix, load_matrix, plant_cells
 from plant.initial import STRAIGHT, InitialShape
+from plant.truncated_force import EXACT, Rest, TruncatedForce, check_model
 from wire.artefact import Arm
 from wire.errors import UsageError
 
@@ -43,7 +44,8 @@ class PlantParameters:
 
     faces_m: faces s_0 = 0 < ... < s_n = L of the n segments; tick_s: how long a command is held;
     initial: shape at t = 0, at rest; cells: of the plant's grid, None for max(40, 4 n); cfl_safety:
-    in (0, 1). Raises UsageError naming the parameter that is wrong.
+    in (0, 1). model: of `plant.truncated_force.MODELS`; a linear one is linear about the shape `about`, which
+    the commands `holding_n_per_m` hold. Raises UsageError naming the parameter that is wrong.
     """
 
     arm: Arm
@@ -53,11 +55,21 @@ class PlantParameters:
     disturbance: DisturbanceSpec = NO_DISTURBANCE
     cells: int | None = None
     cfl_safety: float = CFL_SAFETY
+    model: str = EXACT
+    about: InitialShape = STRAIGHT
+    holding_n_per_m: tuple[float, ...] = ()
+    """One a segment; none: no load."""
 
     def __post_init__(self) -> None:
         faces = check_faces(self.faces_m, self.arm.length_m)
         object.__setattr__(self, "faces_m", faces)
-        object.__setattr__(self, "cells", plant_cells(len(faces) - 1, self.cells))
+        check_model(self.model)
+        exact = self.model == EXACT
+        object.__setattr__(self, "cells", plant_cells(len(faces) - 1, self.cells, exact=exact))
+        if len(self.holding_n_per_m) not in (0, self.segments):
+            raise UsageError(
+                f"holding_n_per_m: expected {self.segments} loads, got {len(self.holding_n_per_m)}"
+            )
         if not (math.isfinite(self.tick_s) and self.tick_s > 0.0):
             raise UsageError(f"tick_s: expected a positive number of seconds, got {self.tick_s!r}")
         if not 0.0 < self.cfl_safety < 1.0:
@@ -73,7 +85,8 @@ class PlantParameters:
     @property
     def grid(self) -> Grid:
         """The plant's own grid."""
-        return Grid(plant_cells(self.segments, self.cells), self.arm.length_m)
+        exact = self.model == EXACT
+        return Grid(plant_cells(self.segments, self.cells, exact=exact), self.arm.length_m)
 
 
 def highest_frequency_rad_per_s(arm: Arm, grid: Grid, shortest_stretch: float = 1.0) -> float:
@@ -129,17 +142,29 @@ class ArmPlant:
         self._disturbance: Disturbance | None = None
         if parameters.disturbance.name != "none":
             self._disturbance = make_disturbance(parameters.disturbance, arm)
-        self._force = ElasticForce(grid, arm.axial_stiffness_n, arm.bending_stiffness_n_m2)
+        faces = np.asarray(parameters.faces_m)
+        self._load = load_matrix(faces, grid) / self._mass[:, None]  # acceleration per N/m
+        self._force, self._fastest_rad_per_s = self._forces()
         self._viscous = _viscous_step(arm, grid)
         self._position = _initial_position(parameters.initial, grid)
         self._velocity = np.zeros(grid.cells, dtype=np.complex128)  # of the free nodes 1..cells
         self._command = np.zeros(parameters.segments)
-        faces = np.asarray(parameters.faces_m)
-        self._load = load_matrix(faces, grid) / self._mass[:, None]  # acceleration per N/m
         self._at_outer = interpolation_matrix(faces[1:], grid.nodes_m)[:, 1:]  # v(0) = 0
         self._at_inner = interpolation_matrix(faces[:-1], grid.nodes_m)
         self._at_centre = interpolation_matrix(0.5 * (faces[1:] + faces[:-1]), grid.centres_m)
         self._shape_matrices: dict[bytes, Array] = {}
+
+    def _forces(self) -> tuple[ElasticForce, float]:
+        """The model's forces, and how fast what they are linear about moves or grows (exact: 0, it has a
+        bound)."""
+        parameters, grid = self.parameters, self._grid
+        arm = parameters.arm
+        if parameters.model == EXACT:
+            return ElasticForce(grid, arm.axial_stiffness_n, arm.bending_stiffness_n_m2), 0.0
+        held = np.asarray(parameters.holding_n_per_m or np.zeros(parameters.segments))
+        rest = Rest(_initial_position(parameters.about, grid), self._load @ held)
+        force = TruncatedForce(grid, arm, parameters.model, rest)
+        return force, math.sqrt(float(np.max(np.abs(np.linalg.eigvals(force.jacobian)))))
 
     def substeps(self) -> int:
         """Number of substeps that the next tick takes."""
@@ -148,7 +173,7 @@ class ArmPlant:
         # A state that is not finite takes the ordinary number: it is reported, not repaired.
         stretch = min(1.0, max(shortest, _SHORTEST_CELL)) if math.isfinite(shortest) else 1.0
         frequency = highest_frequency_rad_per_s(self.parameters.arm, self._grid, stretch)
-        return max(1, math.ceil(tick * frequency / (2.0 * safety)))
+        return max(1, math.ceil(tick * max(frequency, self._fastest_rad_per_s) / (2.0 * safety)))
 
     def advance(self, command: Array, tick: int) -> None:
         """Integrate over [tick, tick + 1) times tick_s with the command (n,) in N/m held.
@@ -290,6 +315,14 @@ class ArmPlant:
         )
         return kinetic, axial, bending
 
+    def load_potential(self, command: Array) -> float:
+        """Potential in J of loads (n,) in N/m along y, zero for the straight arm; loads along the normal have
+        none, and give zero."""
+        if self.parameters.arm.actuator != "transverse":
+            return 0.0
+        weights = self._load @ command * self._mass
+        return -float(np.sum(weights * self._position[1:].imag))
+
     def clamp_reaction(self) -> tuple[float, float, float]:
         """What the clamp does to the arm: force (x, y) in N and moment in N m."""
         self._force.set_scale(1.0)
@@ -317,5 +350,7 @@ class ArmPlant:
             wrong = np.flatnonzero(~np.isfinite(values))
             if wrong.size:
                 index = int(wrong[0])
-                return f"plant {field} at s = {places[index]:.4g} m is {values[index]}"
+                model = self.parameters.model
+                why = "" if model == EXACT else f" (plant model {model}, which has no bound)"
+                return f"plant {field} at s = {places[index]:.4g} m is {values[index]}{why}"
         return None

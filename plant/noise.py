@@ -7,6 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from numpy.random import (
+    Generator,
+    Philox,
+    SeedSequence,
+)  # now: NumPy would load it in the first tick
 
 from wire.errors import UsageError
 
@@ -44,8 +49,8 @@ class SensorNoise:
         """
         if tick < 0:
             raise ValueError(f"tick must be 0 or more, got {tick}")
-        key = np.random.SeedSequence(self.seed).generate_state(2, np.uint64)
-        stream = np.random.Philox(key=key, counter=[0, 0, 0, tick])
-        normal: Array = np.random.Generator(stream).standard_normal((segments, 2))
+        key = SeedSequence(self.seed).generate_state(2, np.uint64)
+        stream = Philox(key=key, counter=[0, 0, 0, tick])
+        normal: Array = Generator(stream).standard_normal((segments, 2))
         deviations = np.array([self.velocity_y_m_per_s, self.curvature_per_m])
         return np.asarray(normal * deviations)

@@ -25,6 +25,8 @@ class Pace:
     def __init__(self, config: PaceConfig) -> None:
         self.period_ns = round(config.period_s * 1e9)
         self.hold_ticks = config.hold_ticks
+        self.wait_ticks = (config.hold_ticks + 1) // 2
+        """So many late ticks a sweep is waited for; then it is given up, and every tick has a new one."""
         self.late_in_a_row = 0
         self._zero_ns = 0
         self._work_ns = 0.0
@@ -38,11 +40,16 @@ class Pace:
         return self._zero_ns + tick * self.period_ns
 
     def on_time(self) -> None:
-        """The tick that begins has a sweep."""
+        """The sweep before was over when it should be."""
         self.late_in_a_row = 0
 
+    @property
+    def gives_up(self) -> bool:
+        """Whether the sweep that is late is not waited for any longer."""
+        return self.late_in_a_row > self.wait_ticks
+
     def late(self) -> bool:
-        """The tick that begins has none; False if that is once too often."""
+        """It was not; False if that is once too often."""
         self.late_in_a_row += 1
         return self.late_in_a_row <= self.hold_ticks
 

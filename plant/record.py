@@ -5,6 +5,7 @@ Beside the plant's process; `wire.channels.plant_channels` names the numbers.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from time import monotonic_ns
 from typing import Any
 
@@ -12,7 +13,17 @@ import numpy as np
 import numpy.typing as npt
 
 from plant.model import ArmPlant
-from wire.channels import BATCH_NS, PACE, SHAPE_POINTS, SWEEP_TIMING, plant_channels, width
+from wire.channels import (
+    BATCH_NS,
+    GUARD,
+    PACE,
+    SHAPE_POINTS,
+    SWEEP_TIMING,
+    WELL,
+    columns_of,
+    plant_channels,
+    width,
+)
 from wire.counters import Flow
 from wire.messages import PLANT, encode_batch
 from wire.reference import Reference
@@ -31,7 +42,11 @@ class PlantRecord:
         self._run = run
         self._shape_at = np.linspace(0.0, plant.parameters.arm.length_m, SHAPE_POINTS)
         self._regulated = _regulated_weights(faces_m)
-        self._rows = np.empty((batch, width(plant_channels(plant.parameters.segments))))
+        channels = plant_channels(plant.parameters.segments)
+        self._rows = np.empty((batch, width(channels)))
+        self._well = np.full(plant.parameters.segments, float(WELL))
+        self._health_at = columns_of(channels, "/plant/health")
+        self._guard_at = columns_of(channels, "/plant/guard")
         self._filled = 0
         self._began_ns = 0
         self._publisher: Any = None
@@ -52,8 +67,27 @@ class PlantRecord:
         ]
         shape = self._plant.shape_at(self._shape_at)
         energy = self._plant.energy()
-        parts = (truth.ravel(), tip, [error], wanted, energy, means, shape.ravel(), [0.0])
+        rest = np.zeros(len(GUARD) + len(PACE))
+        parts = (
+            truth.ravel(),
+            tip,
+            [error],
+            wanted,
+            energy,
+            means,
+            shape.ravel(),
+            self._well,
+            rest,
+        )
         return np.concatenate(parts)
+
+    def mark_health(self, state: Array, health: Sequence[int]) -> None:
+        """What the plant knows of each segment's node, as wire.channels.Health, when the tick ends."""
+        state[self._health_at] = health
+
+    def mark_guard(self, state: Array, load_potential_j: float, *, passive: bool) -> None:
+        """What is in force on the arm in the tick."""
+        state[self._guard_at] = float(passive), load_potential_j
 
     def mark_late(self, state: Array) -> None:
         """The tick has no sweep."""

@@ -10,8 +10,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import sys
 
 from recorder.process import RecorderProcess
-from wire.child import Child
-from wire.errors import ExitCode, OctarmError
 from wire.run_config import RecorderConfig
 from wire.serving import serve_child
 
@@ -23,14 +21,9 @@ def main() -> int:
     """Run the recorder; returns the exit code."""
     os.nice(NICENESS)
     parent = int(sys.argv[1]) if len(sys.argv) > 1 else os.getppid()
-    return serve_child("recorder", parent, RecorderConfig, _record)
-
-
-def _record(config: RecorderConfig, child: Child) -> ExitCode:
-    try:
-        return RecorderProcess(config, child).run()
-    except OSError as error:  # a full disk, say: no fault of the program
-        raise OctarmError(f"recording: {error}") from None
+    return serve_child(
+        "recorder", parent, RecorderConfig, lambda c, child: RecorderProcess(c, child).run()
+    )
 
 
 if __name__ == "__main__":

@@ -103,6 +103,8 @@ class Page {
     put("energy", frame.estimation_error === undefined ? "rms along the arm" : `${number(100 * frame.estimation_error)} % in energy`);
     put("p50", frame.sweep_p50_ms === null ? "\u2013" : `${number(frame.sweep_p50_ms)} ms`);
     put("p99", frame.sweep_p99_ms === null ? "\u2013" : `${number(frame.sweep_p99_ms)} ms`);
+    put("guard", frame.passive ? "PASSIVE: static loads only" : "whose gains run");
+    at("guard").classList.toggle("passive", frame.passive);
     put("late", String(frame.late_ticks));
     put("late-of", `of ${frame.ticks_seen} watched`);
     at("late-box").classList.toggle("some", frame.late_ticks > 0);

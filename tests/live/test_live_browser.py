@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 from live_page import address
 
@@ -26,6 +28,7 @@ FLAGS = [
 ]
 NODES = 6
 PATIENCE_MS = 30_000
+expect.set_options(timeout=PATIENCE_MS)
 RUN = (
     *("--nodes", str(NODES), "--initial", "chapter", "--no-plot", "--live"),
     *("--realtime", "--tick", "0.02", "--hold-ticks", "100000", "--ticks"),
@@ -113,10 +116,10 @@ def test_the_page_shows_the_running_arm_and_how_it_ends(
         assert float(page.inner_text(f"#{figure}").removesuffix(unit)) >= 0.0
     assert "slowest: " in page.inner_text("#links-read")
     page.hover("#links", position={"x": 600, "y": 40})
-    assert "longest" in page.inner_text("#links-read")
+    expect(page.locator("#links-read")).to_contain_text("longest")
     assert "slowest" not in page.inner_text("#links-read")
     page.hover('#nodes i[data-row="valid"][data-node="3"]')
-    assert page.inner_text("#nodes-read").startswith("node 3: alive, at tick ")
+    expect(page.locator("#nodes-read")).to_have_text(re.compile("^node 3: alive, at tick "))
     page.screenshot(path=tmp_path / "light.png")
 
     page.emulate_media(color_scheme="dark")
@@ -130,6 +133,7 @@ def test_the_page_shows_the_running_arm_and_how_it_ends(
     assert cli.finish() == 4
     expect(page.locator("#state")).to_have_text("safety stop")
     expect(page.locator("#banner")).to_contain_text("node 2 was ended by SIGKILL")
+    expect(page.locator('#nodes i[data-row="alive"].bad')).to_have_count(1)
     assert visit.cells("alive") == ["bad" if i == 2 else "good" for i in range(NODES)]
     expect(page.locator("body")).not_to_have_class("lost")  # it stays to be read
     assert visit.complaints == []
@@ -164,7 +168,7 @@ def test_a_lost_connection_is_said_and_greys_the_page(start: Start, browser: Any
     visit.wait_for_tick(5)
     page, pid = visit.page, cli.processes()["octarm-live"]
     os.kill(pid, signal.SIGSTOP)
-    expect(page.locator("#state")).to_have_text("no news", timeout=10_000)
+    expect(page.locator("#state")).to_have_text("no news")
     expect(page.locator("body")).to_have_class("lost")
     os.kill(pid, signal.SIGCONT)
     expect(page.locator("body")).to_have_class("running")
@@ -208,13 +212,60 @@ def test_a_narrow_window_has_everything_below_each_other(
 
 
 def test_a_finished_run_stays_on_the_page(start: Start, browser: Any) -> None:
-    cli = start.run(*RUN, "60")
+    cli = start.run(*RUN, "60", "--by-hand", "1")
     visit = Visit(browser, url_of(cli))
     page = visit.page
-    expect(page.locator("#state")).to_have_text("finished", timeout=PATIENCE_MS)
+    # The page is there from the first tick on.
+    expect(page.locator("#state")).to_have_text("waiting for the nodes")
+    cli.wait_for("node 1 is yours to start: ")
+    node = start.node(str(*cli.work.glob("runs/*/node-1.json")))
+    expect(page.locator("#state")).to_have_text("finished")
     assert cli.finish() in (0, 3)
+    assert node.finish() == 0, node.err
     page.wait_for_timeout(300)
     expect(page.locator("body")).to_have_class("finished")
-    assert visit.tick() >= 40
+    assert visit.tick() == np.flatnonzero(~cli.recorded().late)[-1]
     assert visit.complaints == []
+    page.close()
+
+
+def test_a_node_that_dies_and_is_replaced_is_alive_again(
+    start: Start, browser: Any, tmp_path: Path
+) -> None:
+    cli = start.run(*RUN, "1000000", "--restart")
+    visit = Visit(browser, url_of(cli))
+    page = visit.page
+    visit.wait_for_tick(20)
+    assert visit.cells("alive") == ["good"] * NODES
+    page.evaluate(  # a short absence is seen, however fast the page is looked at
+        """() => {
+          window.seen = {};
+          const look = () => {
+            for (const cell of document.querySelectorAll("#nodes i.bad, #nodes i.fair"))
+              window.seen[`${cell.dataset.row} ${cell.dataset.node}`] = cell.className;
+            const text = document.getElementById("nodes-read").textContent;
+            if (text.includes("out: ")) window.seen.read = text;
+          };
+          new MutationObserver(look).observe(document.getElementById("nodes-panel"),
+            { subtree: true, attributes: true, childList: true, characterData: true });
+        }"""
+    )
+    os.kill(cli.processes()["octarm-node2"], signal.SIGKILL)
+    page.wait_for_function("() => window.seen['alive 2'] === 'bad'", timeout=PATIENCE_MS)
+    page.wait_for_function("() => window.seen['on_time 2'] === 'fair'", timeout=PATIENCE_MS)
+    expect(page.locator('#nodes i[data-row="alive"].good')).to_have_count(NODES)
+    expect(page.locator('#nodes i[data-row="on_time"].good')).to_have_count(
+        NODES, timeout=PATIENCE_MS
+    )
+    seen = page.evaluate("() => window.seen")
+    assert "out: 2" in seen["read"]
+    assert "valid 2" not in seen  # it died, and said nothing wrong
+    tick = visit.tick()
+    visit.wait_for_tick(tick + 50)  # and the run goes on
+    page.hover('#nodes i[data-row="alive"][data-node="1"]')
+    assert int(page.inner_text("#nodes-read").split(" bridged")[0].split()[-1]) > 0
+    page.screenshot(path=tmp_path / "replaced.png")
+    assert visit.complaints == []
+    os.kill(cli.processes()["launcher"], signal.SIGINT)
+    cli.finish()
     page.close()

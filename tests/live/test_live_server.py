@@ -16,9 +16,12 @@ from html.parser import HTMLParser
 import pytest
 
 from live.server import HEADERS, MOST_CONNECTIONS, PAGE, LiveServer
-from live.stream import MOST_PAGES, Broadcast
+from live.server import PATIENCE_S as SILENCE_S
+from live.stream import HEARTBEAT_S, MOST_PAGES, Broadcast
 
 FACTS = {"run_id": "r", "nodes": 3}
+WAIT_S = 20.0
+"""For what should happen at once, on a busy machine."""
 
 
 class Served:
@@ -33,14 +36,16 @@ class Served:
     def get(self, path: str = "/", method: str = "GET") -> tuple[int, dict[str, str], bytes]:
         url = f"http://127.0.0.1:{self.port}{path}"
         try:
-            with urllib.request.urlopen(urllib.request.Request(url, method=method), timeout=5) as a:
+            with urllib.request.urlopen(
+                urllib.request.Request(url, method=method), timeout=WAIT_S
+            ) as a:
                 return a.status, dict(a.headers), a.read()
         except urllib.error.HTTPError as error:
             with error:
                 return error.code, dict(error.headers), error.read()
 
     def connect(self) -> socket.socket:
-        return socket.create_connection(("127.0.0.1", self.port), timeout=5)
+        return socket.create_connection(("127.0.0.1", self.port), timeout=WAIT_S)
 
     def raw(self, request: str) -> bytes:
         """All that is answered to these bytes."""
@@ -64,7 +69,7 @@ def served() -> Iterator[Served]:
     served = Served()
     yield served
     served.news.end()
-    assert served.news.empty(3.0)
+    assert served.news.empty(WAIT_S)
     served.server.close()
 
 
@@ -77,7 +82,7 @@ def read_until(client: socket.socket, text: bytes) -> bytes:
     return got
 
 
-def until(condition: object, seconds: float = 5.0) -> None:
+def until(condition: object, seconds: float = WAIT_S) -> None:
     assert callable(condition)
     limit = time.monotonic() + seconds
     while not condition():
@@ -242,11 +247,11 @@ def test_the_stream_has_retry_ids_names_and_data(served: Served) -> None:
         assert b"Content-Type: text/event-stream\r\n" in head
         assert b"Content-Length" not in head
         assert events == b'retry: 2000\n\nid: 1\nevent: state\ndata: {"state":"running"}\n\n'
+        began = time.monotonic()
         served.news.put("frame", b'{"tick":1}')
         assert read_until(client, b"\n\n") == b'id: 2\nevent: frame\ndata: {"tick":1}\n\n'
-        began = time.monotonic()
         assert read_until(client, b"\n\n") == b":\n\n"  # a heartbeat when nothing happens
-        assert 0.5 < time.monotonic() - began < 3.0
+        assert HEARTBEAT_S <= time.monotonic() - began < HEARTBEAT_S + 5.0
 
 
 def test_who_comes_late_gets_the_newest_of_each_kind_in_their_order(served: Served) -> None:
@@ -269,7 +274,7 @@ def test_the_last_event_reaches_everybody_before_the_stream_ends(served: Served)
         for client in clients:
             read_until(client, b"data: over\n\n")
             assert client.recv(1) == b""
-    assert served.news.empty(1.0)
+    assert served.news.empty(WAIT_S)
 
 
 def test_so_many_pages_and_no_more(served: Served) -> None:
@@ -296,7 +301,7 @@ def test_a_page_that_does_not_read_misses_events_and_holds_nobody_up(served: Ser
     with ExitStack() as stack:
         slow = socket.socket()
         slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        slow.settimeout(5)
+        slow.settimeout(WAIT_S)
         slow.connect(("127.0.0.1", served.port))
         stack.enter_context(slow)
         slow.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -319,7 +324,7 @@ def test_a_page_that_never_reads_is_given_up(
     monkeypatch.setattr("live.server._Handler.timeout", 0.3)
     with served.stream():
         until(lambda: served.news.watched)
-        limit = time.monotonic() + 10.0
+        limit = time.monotonic() + WAIT_S
         while served.news.watched:
             assert time.monotonic() < limit
             served.news.put("frame", b"x" * 1_000_000)
@@ -327,8 +332,8 @@ def test_a_page_that_never_reads_is_given_up(
 
 
 def test_clients_that_say_nothing_hold_up_neither_others_nor_the_end() -> None:
+    before = set(threading.enumerate())
     served = Served()
-    threads = threading.active_count()
     with ExitStack() as stack:
         for _ in range(5):
             silent = stack.enter_context(served.connect())
@@ -336,15 +341,18 @@ def test_clients_that_say_nothing_hold_up_neither_others_nor_the_end() -> None:
         stack.enter_context(served.stream())
         until(lambda: served.news.watched)
         assert served.get()[0] == 200
-        assert threading.active_count() >= threads + 6
+        own = set(threading.enumerate()) - before
+        assert len(own) >= 7  # one for each of these, and one that waits for more
         began = time.monotonic()
         served.news.end()
         served.news.empty(1.0)
         served.server.close()
-        assert time.monotonic() - began < 1.0
+        assert (
+            time.monotonic() - began < SILENCE_S / 2
+        )  # nobody has waited for those that say nothing
     with pytest.raises(OSError, match="refused"):
         served.connect().close()
-    until(lambda: threading.active_count() < threads)
+    until(lambda: not any(thread.is_alive() for thread in own))
 
 
 def test_too_many_connections_are_hung_up_on(served: Served) -> None:

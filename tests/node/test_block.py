@@ -21,7 +21,8 @@ from chain_factors import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from node.block import NotFiniteError, SegmentBlock
+from node.block import SegmentBlock
+from node.finite import NotFiniteError
 from node.sweep import NodeSweep, Numbers, payload
 from wire.channels import node_channels, width
 from wire.errors import UsageError
@@ -160,7 +161,8 @@ def test_numbers_are_those_of_the_equations() -> None:
     assert row[7:9] == [0.0, 0.0]
     assert row[9:18] == [*now["forward"], *now["backward"]]
     assert row[18:21] == [2009 - EPOCH_NS, 2007 - EPOCH_NS, 2005 - EPOCH_NS]
-    assert len(row) == 22
+    assert row[22] == 0.0  # nothing was other than it should be
+    assert len(row) == 23
     # The next tick starts from this output.
     bench.tick(now)
     np.testing.assert_allclose(bench.rows()[1, 2:7], out, rtol=1e-13)

@@ -259,21 +259,54 @@ def test_no_more_ticks_are_left_out_than_may_be(paced: Bench) -> None:
     assert state(paced) == before
 
 
-def test_a_tick_that_has_begun_is_not_left_out(paced: Bench) -> None:
-    give_all(paced, 0)
-    give(paced, "forward", 1)
-    before = state(paced)
+def test_a_neighbour_that_is_gone_is_not_waited_for_unless_this_node_leaves_too(
+    paced: Bench,
+) -> None:
+    give(paced, "measurement", 0)
+    give(paced, "forward", 0)
+    paced.bus.vanish(KEYS.ready(2))
+    assert [len(paced.bus.of(key)) for key in (KEYS.backward(0), KEYS.command(1))] == [1, 1]
+    give_all(paced, 1)  # it is there again
     give(paced, "measurement", 2)
-    assert paced.rejections == {"early": 1}
-    assert state(paced) == before
+    sent = list(paced.bus.sent)
+    paced.process._leaving = True
+    paced.process._publishers.clear()
+    paced.bus.vanish(KEYS.ready(2))  # nothing is left to send it with
+    assert paced.bus.sent == sent
 
 
-def test_a_message_that_is_refused_leaves_no_tick_out(paced: Bench) -> None:
+def test_in_lock_step_a_tick_that_has_begun_is_not_given_up(bench: Bench) -> None:
+    give_all(bench, 0)
+    give(bench, "forward", 1)
+    before = state(bench)
+    give(bench, "measurement", 2)
+    assert bench.rejections == {"early": 1}
+    assert state(bench) == before
+
+
+@pytest.mark.parametrize("what", ["forward", "backward"])
+def test_a_sum_of_other_gains_leaves_nobody_waiting_for_the_right_one(
+    paced: Bench, what: str
+) -> None:
+    """It cannot be used; the one before stands for it, and the root's side follows the tip's."""
     give_all(paced, 0)
-    before = state(paced)
-    give(paced, "measurement", 2, setpoint=1)
+    give(paced, "measurement", 1)
+    announced = {"values": [*D[:-1], 1.0]} if what == "backward" else {}
+    give(paced, what, 1, setpoint=1, **announced)
     assert paced.rejections == {"setpoint": 1}
-    assert state(paced) == before
+    give(paced, "backward" if what == "forward" else "forward", 1)
+    assert paced.process._block.tick == 2
+    assert paced.process._block.bridged == 1
+    assert paced.process._block.setpoint == (1 if what == "backward" else 0)
+
+
+def test_a_sum_of_gains_that_the_run_does_not_use_changes_nothing(bench: Bench) -> None:
+    give_all(bench, 0)
+    give(bench, "measurement", 1)
+    before = state(bench)
+    give(bench, "forward", 1, setpoint=1)
+    assert bench.rejections == {"setpoint": 1}
+    assert state(bench) == before
 
 
 def test_batches_that_wait_for_the_main_thread_are_not_written_over() -> None:
@@ -285,7 +318,7 @@ def test_batches_that_wait_for_the_main_thread_are_not_written_over() -> None:
             give_all(one, k)
         clean.process._send_batches()
     bench.process._send_batches()
-    wall = raw_width(bench) - 4
+    wall = raw_width(bench) - 5
     for late, timely in zip(
         bus.of(KEYS.telemetry(1)), clean.bus.of(KEYS.telemetry(1)), strict=True
     ):

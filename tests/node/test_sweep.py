@@ -159,7 +159,7 @@ def test_what_a_tick_knows_is_in_its_row() -> None:
     c, d = [1.0, 2.0, *SO_FAR], [3.0, 4.0, 5.0, 6.0, 0.0]
     out = tick_output(sweep, [0.3, -0.2], c, d)
     row = sweep.row.now(sweep.reference)
-    np.testing.assert_array_equal(row[:-4], [0.3, -0.2, *state, 0.0, 0.0, *c, *d])
+    np.testing.assert_array_equal(row[:-5], [0.3, -0.2, *state, 0.0, 0.0, *c, *d])
     sweep.accept(out)
     np.testing.assert_allclose(sweep.state, out, rtol=1e-15, atol=1e-15)
 
@@ -178,7 +178,7 @@ def test_a_batch_keeps_rows_as_they_were_with_absolute_states() -> None:
                 batch.keep(sweep.reference)
                 sweep.accept(0.1 * sweep.output())
             rows = batch.take()
-            assert rows.shape == (3, 9 + 5 + 5 + 4), rounds
+            assert rows.shape == (3, 9 + 5 + 5 + 4 + 1), rounds
             np.testing.assert_array_equal(rows[:, 2:7], states)
 
 

@@ -21,7 +21,7 @@ from deploy import SegmentGrid, deploy
 from deploy.path import make_references
 from plant.pace import LEAD_NS, Pace
 from plant.process import SAFE_TICKS, PlantProcess
-from wire.channels import plant_channels, width
+from wire.channels import WELL, Health, plant_channels, width
 from wire.child import Child
 from wire.keys import Keys
 from wire.messages import (
@@ -277,7 +277,7 @@ def test_messages_are_not_kept_for_the_whole_run() -> None:
 
 
 def test_late_sweeps_make_the_following_ticks_late_and_the_commands_are_held() -> None:
-    run = Run({4: 15_000_000, 9: 25_000_000})
+    run = Run({4: 15_000_000, 9: 25_000_000}, hold=4)
     assert run.stop.cause == "finished"
     assert run.recorded == list(range(TICKS))
     assert run.late == [5, 10, 11]
@@ -305,7 +305,7 @@ delays = st.integers(0, 45_000_000).filter(lambda delay_ns: delay_ns % PERIOD_NS
 def test_whatever_the_delays_a_tick_is_late_exactly_if_the_sweep_before_is_not_over(
     delays_ns: dict[int, int], work_ns: int
 ) -> None:
-    run = Run(delays_ns, hold=10, work_ns=work_ns)
+    run = Run(delays_ns, hold=12, work_ns=work_ns)
     expected, free_at = [], 0
     for k in range(TICKS):
         if k < free_at:
@@ -334,12 +334,12 @@ def test_emulation_that_takes_long_delays_ticks_but_loses_none() -> None:
 
 
 def test_after_too_many_late_ticks_the_arm_rests_under_the_holding_loads() -> None:
-    run = Run({5: None})
-    first = 6 + HOLD  # ticks 6 and 7 may be late, 8 is once too often
+    run = Run(dict.fromkeys(range(5, TICKS)))
+    first = 6 + HOLD  # in 6 the sweep is waited for, in 7 there is a new one, 8 is once too often
     assert run.stop.cause == "safety"
     assert run.stop.tick == first
     assert f"tick {first}: {HOLD + 1} late ticks in a row, {HOLD} may be" in run.stop.text
-    assert "the sweep of tick 5 has no command from nodes 0, 1, 2" in run.stop.text
+    assert "the sweep of tick 7 has no command from nodes 0, 1, 2" in run.stop.text
     assert "setpoint 1" in run.stop.text
     assert run.ordered[0] == run.stop
     for k, held in enumerate(run.held[:first]):
@@ -348,7 +348,9 @@ def test_after_too_many_late_ticks_the_arm_rests_under_the_holding_loads() -> No
     for held in run.held[first:]:
         np.testing.assert_array_equal(held, run.rest)
     assert run.recorded == list(range(first + SAFE_TICKS))
-    assert run.late == list(range(6, first + SAFE_TICKS))
+    assert run.late == [6, *range(first, first + SAFE_TICKS)]
+    assert run.column("/plant/guard", "passive") == [float(k >= first) for k in run.recorded]
+    assert run.column("/plant/health", "node_00")[5:first] == [WELL & ~Health.ON_TIME] * 3
     assert np.isfinite(run.rows).all()
 
 
@@ -356,6 +358,17 @@ def test_no_late_tick_at_all_may_be_asked_for() -> None:
     run = Run({2: 11_000_000}, hold=0)
     assert (run.stop.cause, run.stop.tick) == ("safety", 3)
     assert run.measured == [0, 1, 2]
+
+
+def test_a_sweep_that_never_ends_is_given_up_and_a_new_one_begun() -> None:
+    run = Run({5: None})
+    assert run.stop.cause == "finished"
+    assert run.late == [6]
+    assert run.measured == [k for k in range(TICKS) if k != 6]
+    assert (run.counters["late_ticks"], run.counters["bridged_ticks"]) == (1, 1)
+    in_use = [-1, 0, 1, 2, 3, 4, 4, 4, 7, 8, 9, 10, 11, 12]
+    for held, said in zip(run.held, in_use, strict=True):
+        np.testing.assert_array_equal(held, run.command(said))
 
 
 @pytest.mark.parametrize("delay_ns", [QUICK_NS, 8_000_000])

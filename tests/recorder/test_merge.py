@@ -64,6 +64,21 @@ def test_a_gap_is_kept_and_the_others_go_on() -> None:
     assert merge.gaps == [Gap(1, 2, 4)]
 
 
+def test_the_others_rows_wait_for_a_sender_that_is_out() -> None:
+    """A second at 100 Hz: nothing is handed out before its next row, and then everything at once, in order."""
+    merge = TickMerge([0, 1])
+    merge.add(batch(1, 0, 10))
+    for tick in range(0, 110, 10):
+        merge.add(batch(0, tick, 10))
+        assert len(list(merge.complete())) == (10 if tick == 0 else 0)
+    merge.add(batch(1, 110, 5))  # the replacement's first
+    merge.add(batch(0, 110, 5))
+    rows = list(merge.complete())
+    assert [tick for tick, _ in rows] == list(range(10, 115))
+    assert all(set(own) == ({0} if tick < 110 else {0, 1}) for tick, own in rows)
+    assert merge.gaps == [Gap(1, 10, 110)]
+
+
 def test_a_sender_that_ended_holds_nobody_up() -> None:
     merge = TickMerge([0, 1, 2])
     merge.add(batch(0, 0, 3))

@@ -13,11 +13,19 @@ import pytest
 
 from analysis.mcap_file import read_mcap
 from recorder.process import RecorderProcess
-from wire.channels import SUMMARY, node_channels, plant_channels, width
+from wire.channels import SUMMARY, WELL, columns_of, node_channels, plant_channels, width
 from wire.child import Child
 from wire.errors import ExitCode
 from wire.joints import TipConfig
-from wire.messages import PLANT, encode_batch, encode_counters, run_tag
+from wire.messages import (
+    PLANT,
+    Kind,
+    decode_counters,
+    encode_batch,
+    encode_counters,
+    kind_of,
+    run_tag,
+)
 from wire.reference import TERMS, Leg, Reference
 from wire.run_config import (
     DisturbanceConfig,
@@ -38,6 +46,8 @@ PLANT_FIELDS = [
 ]
 REST = Reference(0.1, [Leg(0.0, 0.0, np.zeros((TERMS, 7, 1)))])
 LATE = PLANT_FIELDS.index(("/plant/pace", "late"))
+PASSIVE = PLANT_FIELDS.index(("/plant/guard", "passive"))
+HEALTH = columns_of(plant_channels(NODES), "/plant/health")
 SETPOINT = [field for channel in LAYOUT[0] for field in channel.fields].index("setpoint")
 
 
@@ -119,8 +129,15 @@ def node_rows(node: int, ticks: Sequence[int]) -> list[bytes]:
     return out
 
 
-def plant_rows(late: Sequence[int], ticks: int = TICKS) -> list[bytes]:
+def plant_rows(
+    late: Sequence[int], ticks: int = TICKS, out: Sequence[tuple[int, int]] = ()
+) -> list[bytes]:
+    """`out`: (tick, node) of which the plant had no command in time."""
     rows = np.ones((ticks, len(PLANT_FIELDS)))
+    rows[:, HEALTH] = WELL
+    rows[:, PASSIVE] = 0.0
+    for tick, node in out:
+        rows[tick, HEALTH.start + node] = 0.0
     rows[:, LATE] = 0.0
     rows[list(late), LATE] = 1.0
     return [encode_batch(RUN, 0, PLANT, rows)]
@@ -259,6 +276,52 @@ def test_of_a_gap_with_late_ticks_the_others_are_lost(
     assert recorded.totals["ticks_lost"] == 2
 
 
+def test_of_a_node_that_was_out_only_what_went_with_its_process_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was killed in tick 5, with the row of tick 4 not sent; its replacement begins in tick 8."""
+    raws = [
+        *plant_rows([], out=[(5, 1), (6, 1), (7, 1)]),
+        *node_rows(0, range(TICKS)),
+        *node_rows(1, without(4, 5, 6, 7)),
+        *node_rows(2, range(TICKS)),
+        *ends(),
+    ]
+    recorded = Recorded(tmp_path / "a.mcap", raws, monkeypatch)
+    assert recorded.events == [("telemetry_lost", 4)]
+    assert "ticks 4 to 7 were lost, but for 3 that it may not have done" in recorded.texts[0]
+    assert recorded.totals["ticks_lost"] == 1
+    assert recorded.totals["ticks_recorded"] == TICKS
+    assert recorded.ticks("/node/00/command") == list(range(TICKS))  # the others' rows of the gap
+
+
+def test_a_node_that_is_out_for_ever_holds_back_nothing_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says no last word: what the others sent in the meantime is written when the file is closed."""
+    out = [(tick, 1) for tick in range(5, TICKS)]
+    raws = [
+        *plant_rows([], out=out),
+        *node_rows(0, range(TICKS)),
+        *node_rows(1, range(5)),
+        *node_rows(2, range(TICKS)),
+        *ends(),
+    ]
+    raws = [raw for raw in raws if not (kind_of(raw) is Kind.COUNTERS and is_from(raw, 1))]
+    recorded = Recorded(tmp_path / "a.mcap", raws, monkeypatch)
+    assert recorded.events == []
+    assert recorded.totals["ticks_lost"] == 0
+    assert recorded.totals["nodes_reporting"] == NODES - 1
+    assert recorded.ticks("/node/00/command") == list(range(TICKS))
+    assert recorded.ticks("/plant/pace") == list(range(TICKS))
+    assert recorded.ticks("/node/01/command") == list(range(5))
+
+
+def is_from(raw: bytes, sender: int) -> bool:
+    """Whether these counters are a sender's."""
+    return decode_counters(raw, RUN)[0] == sender
+
+
 def test_a_node_that_has_a_row_of_a_late_tick_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -267,3 +330,30 @@ def test_a_node_that_has_a_row_of_a_late_tick_loses_nothing(
     recorded = Recorded(tmp_path / "a.mcap", raws, monkeypatch)
     assert recorded.events == [("late", 5)]
     assert recorded.ticks("/node/01/command") == list(range(TICKS))
+
+
+@pytest.mark.timeout(30)
+@pytest.mark.parametrize("tick", [TICKS + 1001, 10**9, 2**53])
+def test_telemetry_and_last_words_of_ticks_that_the_run_has_not_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tick: int
+) -> None:
+    """They made every later row a repeated one, and a gap whose ticks were counted one by one, for ever."""
+    wrong = [*node_rows(1, [tick]), encode_counters(RUN, tick, 1, {})]
+    good = [*plant_rows([]), *all_nodes(range(TICKS)), *ends()]
+    got = Recorded(tmp_path / "r.mcap", [*wrong, *good], monkeypatch)
+    assert got.ticks("/node/01/measurement") == list(range(TICKS))
+    assert got.totals["ticks_lost"] == 0
+    refused = json.loads(got.summary["recorder"])
+    assert refused["rejected_tick"] == refused["rejected_messages"] == 2
+
+
+def test_a_setpoint_that_there_is_not_is_recorded_and_does_not_end_the_recorder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    strange = encode_batch(RUN, 0, 0, np.full((1, width(LAYOUT[0])), 1e100))
+    rest = [
+        *node_rows(0, range(1, TICKS)),
+        *(m for i in (1, 2) for m in node_rows(i, range(TICKS))),
+    ]
+    got = Recorded(tmp_path / "r.mcap", [strange, *rest, *plant_rows([]), *ends()], monkeypatch)
+    assert got.totals["ticks_recorded"] == TICKS
