@@ -14,6 +14,7 @@ from design import legendre
 from design.setpoint import Setpoint, equilibrium_load, from_shape
 from wire.artefact import ACTUATORS, SENSOR_SETS, Arm
 from wire.errors import UsageError
+from wire.files import TEXT_BYTES, read_limited
 
 FIRST_BENDING_ROOT = 1.8751040687119611
 """First root of cos(b) cosh(b) = -1: a clamped-free beam bends at b^2 sqrt(EI / (rho A)) / L^2."""
@@ -138,14 +139,14 @@ def axial_ratio(arm: Arm) -> float:
 def read_arm_file(path: Path) -> ArmFile:
     """Read and check an arm file; UsageError names the file, the key and what is expected."""
     try:
-        raw = path.read_bytes()
+        raw = read_limited(path, TEXT_BYTES)
     except OSError as error:
         raise UsageError(
             f"arm file {path}: {error.strerror or error}; give another with --arm"
         ) from None
     try:
         arm = msgspec.toml.decode(raw, type=ArmFile)
-    except (msgspec.DecodeError, UnicodeDecodeError, OverflowError, RecursionError) as error:
+    except (msgspec.DecodeError, ValueError, OverflowError, RecursionError) as error:
         raise UsageError(f"arm file {path}: {error}{_unit_hint(str(error))}") from None
     check_arm_file(arm, str(path))
     return arm

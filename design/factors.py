@@ -16,6 +16,9 @@ from design.inverse import SampledKernels
 from design.legendre import Array
 from design.operators import PIOperator, Shape
 
+ROUNDING = 2e-15
+"""Directions of a kernel below this, relative to the largest, are rounding whatever the tolerance."""
+
 
 @dataclass(frozen=True)
 class GainFactors:
@@ -68,22 +71,28 @@ def factorise(
 
     rank_tolerance: directions of a kernel smaller than this times the gain's size are dropped, where the
     size is the largest L2 norm of an entry of the multiplier or singular value of a kernel. The share is
-    their root sum of squares over the whole square: it bounds the operator norm of what was dropped.
+    their root sum of squares over the whole square: it bounds the operator norm of what was dropped. Of
+    kernels that grow along the arm the square is much larger than the gain: there the size is less by as much
+    (`SampledKernels.finer`).
     fit_tolerance: the same for polynomial coefficients.
     """
-    n0 = legendre.fit(gain.multiplier)
+    n0 = legendre.interpolate(gain.multiplier)
     kernels = [(gain.outer1, gain.inner1), (gain.outer2, gain.inner2)]
-    split = [_split(legendre.fit(outer), legendre.fit(inner)) for outer, inner in kernels]
-    level = max(
+    split = [
+        _split(legendre.interpolate(outer), legendre.interpolate(inner)) for outer, inner in kernels
+    ]
+    largest = max(
         float(np.linalg.norm(n0, axis=2).max()), *(float(v.max(initial=0.0)) for _, v, _ in split)
     )
+    level = largest / gain.finer
+    floor = ROUNDING * largest
     dropped = 0.0
     parts: list[Array] = []
     for left, values, right in split:
-        keep = int(np.count_nonzero(values > rank_tolerance * level))
+        keep = int(np.count_nonzero(values > max(rank_tolerance * level, floor)))
         dropped += float(np.sum((values[keep:] / max(level, 1e-300)) ** 2))
         root = np.sqrt(values[:keep])
-        cut = fit_tolerance * np.sqrt(level)
+        cut = fit_tolerance * np.sqrt(level / gain.finer)
         parts.append(legendre.trim(left[:, :keep] * root[None, :, None], (2,), cut))
         parts.append(legendre.trim(right[:keep] * root[:, None, None], (2,), cut))
     n0 = legendre.trim(n0, (2,), fit_tolerance * level)

@@ -67,11 +67,11 @@ class Moments:
 
     def functions(self, moments: Array) -> Array:
         """Rows of coordinates (k, m) as vectors of polynomials (k, 4, d)."""
-        return _assembled(moments, self.bases)
+        return assembled(moments, self.bases)
 
     def output_functions(self, moments: Array) -> Array:
         """Rows of coordinates (k, r) as vectors of polynomials of the outputs (k, outputs, d)."""
-        return _assembled(moments, self.output_bases)
+        return assembled(moments, self.output_bases)
 
 
 def make_moments(problem: HinfProblem, count: int) -> Moments:
@@ -79,7 +79,7 @@ def make_moments(problem: HinfProblem, count: int) -> Moments:
     if count < 1:
         raise ValueError(f"moments: expected at least 1 polynomial a state, got {count}")
     n = problem.T.shape_out.functions
-    phi = _monomials(n, count)
+    phi = monomials(n, count)
     raw = dual(phi, problem.krylov)
     left, values, _ = np.linalg.svd(raw.reshape(len(raw), -1), full_matrices=False)
     keep = values > SHORTEST * values[0]
@@ -94,20 +94,20 @@ def make_moments(problem: HinfProblem, count: int) -> Moments:
     selected = _selected(problem.C2)
     outputs = problem.C2.shape_out.functions
     if selected is None:
-        seen = dual(_monomials(outputs, count + EXTRA_OUTPUTS), problem.C2)
-        bases = tuple(_basis([f[:, i] for f in (*needed, seen)]) for i in range(n))
+        seen = dual(monomials(outputs, count + EXTRA_OUTPUTS), problem.C2)
+        bases = tuple(span_basis([f[:, i] for f in (*needed, seen)]) for i in range(n))
         output_bases: tuple[Array, ...] = (np.eye(count + EXTRA_OUTPUTS),) * outputs
     else:
-        bases = tuple(_basis([f[:, i] for f in needed]) for i in range(n))
+        bases = tuple(span_basis([f[:, i] for f in needed]) for i in range(n))
         output_bases = tuple(bases[i] for i in selected)
 
     def coordinates(functions: Array) -> Array:
-        return _coordinates(functions, bases)
+        return coordinates_in(functions, bases)
 
     places = np.cumsum([0, *map(len, output_bases)])
-    test = _assembled(np.eye(places[-1]), output_bases)
-    of_h = _coordinates(dual(h, problem.C2.adjoint), output_bases)
-    first = _coordinates(_monomials(outputs, count), output_bases)
+    test = assembled(np.eye(places[-1]), output_bases)
+    of_h = coordinates_in(dual(h, problem.C2.adjoint), output_bases)
+    first = coordinates_in(monomials(outputs, count), output_bases)
     return Moments(
         bases=bases,
         output_bases=output_bases,
@@ -120,8 +120,8 @@ def make_moments(problem: HinfProblem, count: int) -> Moments:
         SB=coordinates(SB),
         C1=coordinates(C1),
         outputs=coordinates(dual(test, problem.C2)),
-        x_span=_orthonormal(np.concatenate([coordinates(f) for f in (h, phi, SB)])),
-        y_span=_orthonormal(np.concatenate([of_h, first])),
+        x_span=orthonormal(np.concatenate([coordinates(f) for f in (h, phi, SB)])),
+        y_span=orthonormal(np.concatenate([of_h, first])),
         S=S,
         eta=MARGIN_OF_ETA * float(np.abs(np.linalg.eigvalsh(S.discretise(32))).max()),
     )
@@ -146,12 +146,13 @@ def _selected(C2: PIOperator) -> tuple[int, ...] | None:
     return tuple(map(int, places)) if constant and picks else None
 
 
-def _monomials(n: int, count: int) -> Array:
+def monomials(n: int, count: int) -> Array:
     """phi_j of state i for all i and j < count: (n count, n, count)."""
     return np.asarray(np.einsum("ab,cd->acbd", np.eye(n), np.eye(count)).reshape(-1, n, count))
 
 
-def _assembled(moments: Array, bases: Sequence[Array]) -> Array:
+def assembled(moments: Array, bases: Sequence[Array]) -> Array:
+    """Functions (k, n, d) from their coordinates (k, sum of basis sizes); the inverse of `coordinates_in`."""
     width = max(b.shape[1] for b in bases)
     out = np.zeros((len(moments), len(bases), width))
     start = 0
@@ -161,7 +162,7 @@ def _assembled(moments: Array, bases: Sequence[Array]) -> Array:
     return out
 
 
-def _coordinates(functions: Array, bases: Sequence[Array]) -> Array:
+def coordinates_in(functions: Array, bases: Sequence[Array]) -> Array:
     """Inner products with all basis functions: (k, sum of basis sizes)."""
     parts = []
     for i, basis in enumerate(bases):
@@ -170,15 +171,16 @@ def _coordinates(functions: Array, bases: Sequence[Array]) -> Array:
     return np.concatenate(parts, axis=1)
 
 
-def _basis(parts: Sequence[Array]) -> Array:
+def span_basis(parts: Sequence[Array]) -> Array:
     """Orthonormal basis (r, d) of the span of scalar polynomials given as rows."""
     width = max(p.shape[1] for p in parts)
     rows = np.concatenate([np.pad(p, ((0, 0), (0, width - p.shape[1]))) for p in parts])
     norms = np.linalg.norm(rows, axis=1)
     keep = norms > ROUNDING * norms.max()
-    return _orthonormal(rows[keep] / norms[keep][:, None])
+    return orthonormal(rows[keep] / norms[keep][:, None])
 
 
-def _orthonormal(rows: Array) -> Array:
+def orthonormal(rows: Array) -> Array:
+    """Orthonormal basis of the span of rows."""
     _, values, right = np.linalg.svd(rows, full_matrices=False)
     return np.asarray(right[values > ROUNDING * values[0]])

@@ -165,17 +165,6 @@ def facts(request: Request, result: Result, peak_memory_mb: float | None = None)
     }
 
 
-def finite(value: Any) -> Any:
-    """The same data with None for every number that is not finite, as JSON needs it."""
-    if isinstance(value, dict):
-        return {key: finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(entry) for entry in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
 def _attempt_facts(attempt: Attempt) -> dict[str, Any]:
     return asdict(attempt) | {"gram_sizes": list(attempt.gram_sizes), "seconds": attempt.seconds}
 

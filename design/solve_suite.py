@@ -18,6 +18,7 @@ from design.lpi.result import Status
 from design.pde.names import suggestion
 from design.pde.problem_file import Task
 from wire.errors import UsageError
+from wire.files import TEXT_BYTES, read_limited
 
 ROUNDING = 1e-4
 """Allowance on the wrong side of the truth, relative: the reference values are given to that many digits."""
@@ -70,11 +71,11 @@ def read_suite(path: Path, only: Sequence[str] = ()) -> tuple[Row, ...]:
     """
     where = f"suite {path}"
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(read_limited(path, TEXT_BYTES).decode())
         rows = msgspec.convert(data, _File).rows
     except OSError as error:
         raise UsageError(f"{where}: {error.strerror or error}") from None
-    except ValueError as error:  # TOML, UTF-8 and msgspec's errors are all of this kind
+    except (ValueError, RecursionError) as error:  # of TOML, UTF-8 and msgspec
         raise UsageError(f"{where}: {error}") from None
     names = [row.id for row in rows]
     if not names or len(set(names)) < len(names):

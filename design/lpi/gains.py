@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from design import legendre
-from design.inverse import SINGULAR, SampledKernels, solve_gain
+from design.inverse import SINGULAR, SampledKernels, solve_columns, solve_gain
 from design.legendre import Array
 from design.operators import PIOperator, Shape, horizontal, vertical
 
@@ -67,17 +67,14 @@ def gain_operator(P: PIOperator, Z: PIOperator) -> tuple[PIOperator, float]:
 
 
 def _inverse_times(R: PIOperator, Z: PIOperator) -> tuple[PIOperator, float]:
-    """R^-1 Z for a 3-PI R: kernels by the ODE, columns as multipliers applied to the constant one."""
+    """R^-1 Z for a 3-PI R: kernels and columns by the ODE."""
     n = R.shape_in.functions
     finite, functions = Z.shape_in
     parts = []
-    tail = 0.0
+    tail, finer = 0.0, 1.0
     if finite:
-        columns = solve_gain(R, PIOperator.multiplier(Z.q2))
-        parts.append(
-            PIOperator.zeros(Shape(0, n), Shape(finite, 0)).replace(q2=_on_constants(columns))
-        )
-        tail = max(tail, columns.tail)
+        columns, tail = solve_columns(R, Z.q2)
+        parts.append(PIOperator.zeros(Shape(0, n), Shape(finite, 0)).replace(q2=columns))
     if functions:
         kernels = solve_gain(
             R,
@@ -91,33 +88,18 @@ def _inverse_times(R: PIOperator, Z: PIOperator) -> tuple[PIOperator, float]:
             ),
         )
         parts.append(_fitted(kernels))
-        tail = max(tail, kernels.tail)
+        tail, finer = max(tail, kernels.tail), kernels.finer
     if not parts:
         return Z, 0.0
-    return horizontal(*parts).trimmed(1e-12), tail
-
-
-def _on_constants(kernels: SampledKernels) -> Array:
-    """The operator applied to constant functions: coefficients (q, m, d)."""
-    count = kernels.multiplier.shape[2]
-    nodes, _ = legendre.gauss(count)
-    integral = legendre.integration(count, count + 1) @ legendre.basis(nodes, count + 1).T
-    low = legendre.fit(kernels.inner1) @ integral
-    inner = legendre.fit(kernels.inner2)
-    high = inner[..., :1] - inner @ integral
-    samples = (
-        kernels.multiplier
-        + np.einsum("qra,rma->qma", kernels.outer1, low)
-        + np.einsum("qra,rma->qma", kernels.outer2, high)
-    )
-    return legendre.fit(samples)
+    return horizontal(*parts).trimmed(1e-12 / finer), tail
 
 
 def _fitted(kernels: SampledKernels) -> PIOperator:
     """The operator with polynomial kernels, interpolated at the samples."""
-    operator = PIOperator.multiplier(legendre.fit(kernels.multiplier))
+    operator = PIOperator.multiplier(legendre.interpolate(kernels.multiplier))
     outer1, inner1, outer2, inner2 = (
-        legendre.fit(x) for x in (kernels.outer1, kernels.inner1, kernels.outer2, kernels.inner2)
+        legendre.interpolate(x)
+        for x in (kernels.outer1, kernels.inner1, kernels.outer2, kernels.inner2)
     )
     return operator.replace(
         r1=np.einsum("qri,rmj->qmij", outer1, inner1),

@@ -14,8 +14,8 @@ from design.pde.expression import Role, read_expression
 from design.pde.model import Expression, Output, Pde, Signal, StateVariable
 from design.pde.names import RESERVED, Names, suggestion
 from design.pde.problem_schema import ProblemFile, decode
-from design.pde.syntax import shortened
-from wire.errors import UsageError
+from wire.errors import UsageError, shown
+from wire.files import TEXT_BYTES, read_limited
 
 MAX_ORDER = 8
 """Of a state: the highest derivative that problem files may use."""
@@ -62,7 +62,7 @@ class Problem:
 def read_problem_file(path: Path, overrides: Mapping[str, float] | None = None) -> Problem:
     """Read a problem file; UsageError if there is none, or for what it says (see `parse_problem`)."""
     try:
-        raw = path.read_bytes()
+        raw = read_limited(path, TEXT_BYTES)
     except OSError as error:
         raise UsageError(
             f"problem file {path}: {error.strerror or error}; expected a readable TOML file"
@@ -164,7 +164,7 @@ def _state(name: str, order: int | str, where: str) -> StateVariable:
     if isinstance(order, str) or not 0 <= order <= MAX_ORDER:
         raise UsageError(
             f"{where}: states.{name}: expected the order of the highest derivative in s, 0 to {MAX_ORDER}, or "
-            f'"ode" for a state that does not depend on s; got {shortened(repr(order))}'
+            f'"ode" for a state that does not depend on s; got {shown(order)}'
         )
     return StateVariable(name, order)
 

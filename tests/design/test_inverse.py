@@ -222,6 +222,7 @@ def test_wrong_dimensions() -> None:
         (random_operator(rng, square, Shape(0, 3)), good),
         (good, random_operator(rng, Shape(0, 3), square)),
         (PIOperator.identity(finite), PIOperator.identity(finite)),
+        (good, random_operator(rng, square, finite)),
     ):
         with pytest.raises(ValueError, match="square 3-PI operator"):
             solve_gain(P, Z)

@@ -16,8 +16,9 @@ from design.lpi.reporter import Reporter
 from design.lpi.result import Achieved, Attempt, Options, Result, Status
 from design.pde.model import Pde
 from design.pde.problem_file import Bisection, Task
-from design.solve_command import Choices, Request, answer, facts, finite, prepare
+from design.solve_command import Choices, Request, answer, facts, prepare
 from design.solve_suite import Row, judge, read_suite, row_facts
+from wire.config_json import finite
 from wire.errors import UsageError
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
