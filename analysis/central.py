@@ -6,7 +6,8 @@ From the recorded measurements and the deployment alone, tick by tick,
 
 with one dense matrix M of shape (5n, 7n) for each setpoint, and compared with what the nodes recorded
 while each of them held its own few numbers only. Which setpoint's matrix is used is decided here again,
-from the estimate of the whole arm.
+from the estimate of the whole arm. A sum that was bridged is no dense product of anything: the comparison ends
+with the first tick in which the chain was not whole, and says so.
 """
 
 from __future__ import annotations
@@ -58,7 +59,9 @@ class CentralComparison:
     scales: dict[str, float]
     """What each quantity's difference was divided by, SI units."""
     ticks: int
-    """Ticks compared: up to the first one with a missing measurement."""
+    """Ticks compared: up to the first one with a missing measurement, or the first degraded one."""
+    degraded_from: int | None
+    """The last tick compared, if the chain was not whole in it any more; its state is still a whole one's."""
     missing: int
     """Estimates and commands in these ticks that the recorder did not get."""
     changes: tuple[int, ...]
@@ -141,6 +144,10 @@ def compare_with_central(recording: Recording, tolerance: float = 1e-12) -> Cent
     ticks = int(np.argmin(usable)) if not usable.all() else usable.size
     # The values of tick k depend on measurements up to k - 1 only.
     ticks = min(ticks + 1, recording.ticks)
+    degraded = recording.first_degraded
+    degraded = None if degraded is None or degraded >= ticks else degraded
+    if degraded is not None:
+        ticks = degraded + 1
     if ticks == 0:
         raise UsageError(f"recording {recording.path}: no complete tick in it; nothing to compare")
     run = central_run(recording, ticks)
@@ -148,11 +155,15 @@ def compare_with_central(recording: Recording, tolerance: float = 1e-12) -> Cent
     recorded = np.concatenate(
         [recording.estimates[:ticks], recording.commands[:ticks, :, None]], axis=2
     )
+    recorded[recording.out[:ticks]] = (
+        np.nan
+    )  # the plant's command in place of a node's that was out
     scales = _scales(central, recording.energy_weights)
     relative = np.abs(recorded - central) / scales
     missing = np.isnan(relative)  # what the recorder did not get cannot be compared
     relative[missing] = 0.0
     missing[recording.late[:ticks]] = False  # and in late ticks there is nothing to get
+    missing[recording.out[:ticks]] = False  # nor of a node that was out
     per_tick: Array = relative.max(axis=(1, 2))
 
     def at(tick: int) -> Difference:
@@ -175,6 +186,7 @@ def compare_with_central(recording: Recording, tolerance: float = 1e-12) -> Cent
         per_quantity=dict(zip(QUANTITIES, relative.max(axis=(0, 1)).tolist(), strict=True)),
         scales=dict(zip(QUANTITIES, scales.tolist(), strict=True)),
         ticks=ticks,
+        degraded_from=degraded,
         missing=int(np.count_nonzero(missing)),
         changes=tuple((1 + np.flatnonzero(np.diff(run.setpoints))).tolist()),
     )

@@ -19,6 +19,7 @@ from analysis.compare_values import KindComparison, Part, Place, compare_kind, k
 from analysis.events import read_events
 from analysis.recording import Recording
 from analysis.table import Table
+from wire.channels import DEGRADED_SINCE, FORMAT_VERSION, Channel, before_version_5
 from wire.foxglove import EVENTS, SCENE
 
 DRAWN = (SCENE.topic,)
@@ -84,7 +85,8 @@ def compare(one: Recording, other: Recording, tolerance: float = 0.0) -> Compari
         a, b = tables[0].get(topic), tables[1].get(topic)
         if a is None or b is None:
             lacks, there = (one, b) if a is None else (other, a)
-            if topic not in DRAWN and not _beyond(there, lacks, end):
+            known = topic not in DRAWN and not _since_then(topic, lacks)
+            if known and not _beyond(there, lacks, end):
                 missing[a is not None].append(topic)
             continue
         pairs[topic] = pair(a, b, ticks_s)
@@ -102,6 +104,12 @@ def compare(one: Recording, other: Recording, tolerance: float = 0.0) -> Compari
         order=order_difference((one.order, other.order), pairs, tables),
         ends=ends,
     )
+
+
+def _since_then(topic: str, recording: Recording) -> bool:
+    """Whether the format of a recording is older than a channel."""
+    older = int(recording.facts.get("format_version", FORMAT_VERSION)) < DEGRADED_SINCE
+    return older and before_version_5(Channel(topic, ())) is not None
 
 
 def _moved(a: Sequence[float], b: Sequence[float]) -> bool:

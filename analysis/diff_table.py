@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from analysis.compare import short
+from analysis.text_table import aligned
 
 MOST_ROWS = 12
 """So many keys of the configuration are shown unless all are asked for."""
@@ -44,7 +45,7 @@ def _facts(title: str, rows: Sequence[dict[str, Any]], everything: bool) -> list
         [r["key"], short(r["a"]), short(r["b"]), "within" if r["within"] else notes[r["counts"]]]
         for r in shown
     ]
-    out = aligned([title, "A", "B", ""], lines)
+    out = _table([title, "A", "B", ""], lines)
     if len(rows) > len(shown):
         out.append(f"and {len(rows) - len(shown)} more (--all)")
     return out
@@ -61,7 +62,7 @@ def _channels(facts: dict[str, Any], everything: bool) -> list[str]:
         else:
             rows = [(kind["kind"], kind)]
         lines += [_channel(name, row, facts["tolerance"]) for name, row in rows]
-    out = aligned(head, lines) if lines else []
+    out = _table(head, lines) if lines else []
     for kind in facts["channels"]:
         for side in "ab":
             if missing := kind[f"messages_missing_in_{side}"]:
@@ -125,7 +126,7 @@ def _figures(rows: Sequence[dict[str, Any]]) -> list[str]:
         ]
         for r in rows
     ]
-    return aligned(["figure", "A", "B", "B / A"], lines)
+    return _table(["figure", "A", "B", "B / A"], lines)
 
 
 def _number(value: float | None) -> str:
@@ -134,16 +135,9 @@ def _number(value: float | None) -> str:
     return str(value) if isinstance(value, int) else f"{value:.6g}"
 
 
-def aligned(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines with columns as wide as they need to be; columns of numbers to the right."""
-    right = [
-        all(_NUMBERS.fullmatch(row[i]) for row in rows) and bool(rows) for i in range(len(head))
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Its lines; columns of numbers to the right."""
+    words = [
+        i for i in range(len(head)) if not (rows and all(_NUMBERS.fullmatch(r[i]) for r in rows))
     ]
-    widths = [max(len(line[i]) for line in (head, *rows)) for i in range(len(head))]
-    return [
-        "  ".join(
-            cell.rjust(width) if to_right else cell.ljust(width)
-            for cell, width, to_right in zip(line, widths, right, strict=True)
-        ).rstrip()
-        for line in (head, *rows)
-    ]
+    return aligned(head, rows, left=words)

@@ -40,7 +40,7 @@ def run_facts(exported: Exported) -> dict[str, Any]:
         "nodes": recording.nodes,
         "ticks": exported.ticks,
         "tick_s": recording.tick_s,
-        "configuration": msgspec.json.decode(recording.facts["run"]),
+        "configuration": json.loads(recording.facts["run"]),  # as wire.config_json has read it
         "arm": msgspec.to_builtins(recording.artefact.arm),
         "metadata": {k: fact(v) for k, v in recording.facts.items() if k != "run"},
         SUMMARY: {k: fact(v) for k, v in (recording.counters or {}).items()},

@@ -20,6 +20,7 @@ from wire.channels import (
     ANNOUNCED,
     ARM_SO_FAR,
     COMMAND,
+    DEGRADED,
     MEASUREMENT,
     SCHEDULE,
     SHAPE,
@@ -35,6 +36,8 @@ from wire.foxglove import EVENTS
 
 Array = npt.NDArray[np.float64]
 
+HEALTH = ("flags",)
+"""Of each node, what /plant/health says of all of them."""
 TIMING = timing_fields(1, 3)
 """All instants of a node: one in the middle has both neighbours."""
 OF_NODES: tuple[tuple[str, tuple[str, ...]], ...] = (
@@ -46,12 +49,14 @@ OF_NODES: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("forward_sum", ARM_SO_FAR),
     ("backward_sum", ANNOUNCED),
     ("timing", TIMING),
+    ("degraded", DEGRADED),
+    ("health", HEALTH),
 )
 """Channels of the table `nodes`, with their fields; the numbers of the sums themselves are in `sums`."""
 OF_PLANT: tuple[tuple[str, str, tuple[str, ...]], ...] = tuple(
     (channel_name(channel.topic), channel.topic, channel.fields)
     for channel in plant_channels(2)
-    if channel_name(channel.topic) not in ("truth", "shape")
+    if channel_name(channel.topic) not in ("truth", "shape", "health")
 )
 """Channels of the table `plant`: name, topic, fields."""
 DIRECTIONS = ("forward", "backward")
@@ -167,6 +172,9 @@ class Exported:
 
     def of_nodes(self, channel: str, fields: Sequence[str]) -> Array:
         """Fields of a channel at all nodes, (K, n, fields); NaN where there is no message or no field."""
+        if channel == "health":
+            names = [f"node_{label(i, self.nodes)}" for i in range(self.nodes)]
+            return self._values("/plant/health", names)[:, :, None]
         root = "/plant/truth/{}" if channel == "truth" else f"/node/{{}}/{channel}"
         topics = [root.format(label(i, self.nodes)) for i in range(self.nodes)]
         return np.stack([self._values(topic, fields) for topic in topics], axis=1)
@@ -189,7 +197,7 @@ class Exported:
         table = self.recording.tables.get(topic)
         letter = direction_letter(direction)
         names = () if table is None else table.columns
-        return sum(name[0] == letter and name[1:].isdigit() for name in names)
+        return sum(name[:1] == letter and name[1:].isdigit() for name in names)
 
     def _values(self, topic: str, fields: Sequence[str]) -> Array:
         out = np.full((self.ticks, len(fields)), np.nan)

@@ -1,7 +1,7 @@
 """What a recording is, in one dictionary: `octarm info --json`. `analysis.info_table` makes text of it.
 
 Last step of the analysis, beside `analysis.summary`: that one says how well the arm did, this one what the file
-holds, whole or cut short. Of the payloads only timing, pace and events are decoded.
+holds, whole or cut short. Of the payloads only timing, pace, health, flags and events are decoded.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from analysis.events import level_name
+from analysis.events import ending_among, level_name
 from analysis.facts import fact
-from analysis.info_flow import message_kinds, process_rows
+from analysis.info_flow import message_kinds, process_rows, total_of
+from analysis.info_health import health_facts
 from analysis.link_times import link_facts, percentiles_ms
-from analysis.recording import ENDINGS
 from analysis.survey import RECOVERED, Survey, configuration_of, survey, ticks_of
-from analysis.table import Table, decode_table
+from analysis.table import LAST_TICK, Table, check_ticks, decode_table
 from wire.channels import METADATA, PACE, SUMMARY, SWEEP_TIMING
-from wire.errors import UsageError
+from wire.config_json import finite
+from wire.errors import UsageError, shown
 from wire.foxglove import EVENTS
 from wire.link_latency import Array
 from wire.run_config import RunConfig
@@ -47,11 +48,16 @@ def info(path: Path) -> dict[str, Any]:
         and topic != EVENTS.topic
         and (table := _table(topic, count.payloads, notes))
     }
+    try:
+        check_ticks(tables.values())
+    except UsageError as error:
+        notes.append(str(error))
+        tables = {}
     counters = found.metadata.get(SUMMARY)
     ticks = None if run is None else ticks_of(found, run)
     channels = _channels(found, run, ticks)
     events = _events(found, run, notes)
-    return {
+    facts = {
         "recording": str(path),
         "format_version": found.metadata.get(METADATA, {}).get("format_version"),
         "whole": found.closed and counters is not None and _nothing_left_out(found),
@@ -61,16 +67,18 @@ def info(path: Path) -> dict[str, Any]:
         "size": _size(found, ticks),
         "channels": channels,
         "channel_groups": channel_groups(channels),
-        "ended": _ended(events),
+        "ended": ending_among(event["name"] for event in events),
         "messages": message_kinds(counters, run, notes),
         "sweep_ms": _sweep(tables.get("/sweep/timing")),
         "links": None if run is None else link_facts(tables, run, found.metadata[METADATA], notes),
-        "losses": _losses(counters, tables.get("/plant/pace")),
+        "losses": _losses(counters, tables.get("/plant/pace"), notes),
+        "health": None if run is None else health_facts(tables, run.nodes),
         "processes": None if run is None else process_rows(counters, run, notes),
         "events": events,
         "attachments": [dataclasses.asdict(one) for one in found.attachments],
         "notes": list(dict.fromkeys(notes)),
     }
+    return {key: finite(value) for key, value in facts.items()}
 
 
 def channel_groups(channels: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -107,13 +115,14 @@ def channel_groups(channels: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]
 
 
 def _wanted(topic: str) -> bool:
-    return topic in (EVENTS.topic, "/plant/pace") or topic.endswith("/timing")
+    judged = ("/plant/pace", "/plant/health", "/plant/guard")
+    return topic in (EVENTS.topic, *judged) or topic.endswith(("/timing", "/degraded"))
 
 
 def _table(topic: str, payloads: list[bytes], notes: list[str]) -> Table | None:
     try:
         table = decode_table(topic, payloads)
-        table.column("tick")
+        _ = table.ticks
     except UsageError as error:
         notes.append(str(error))
         return None
@@ -151,6 +160,7 @@ def _run(found: Survey, run: RunConfig | None) -> dict[str, Any]:
     out: dict[str, Any] = {
         "run_id": facts.get("run_id"),
         "scenario": run and run.scenario,
+        "plant_model": run and run.plant_model,
         "seed": run and run.seed,
         "nodes": run and run.nodes,
         "node_processes": run and len(run.firsts),
@@ -170,7 +180,9 @@ def _duration(run: RunConfig | None, ticks: int | None, sweep: Table | None) -> 
         with_times = _columns(sweep, ("started_wall_ns", "duration_wall_ns"))
         if with_times is not None:
             started, duration = with_times
-            wall_s = 1e-9 * float((started + duration).max() - started.min())
+            there = np.isfinite(started) & np.isfinite(duration)
+            if there.any():
+                wall_s = 1e-9 * float((started + duration)[there].max() - started[there].min())
     return {
         "ticks": ticks,
         "ticks_asked_for": run and run.ticks,
@@ -237,13 +249,14 @@ def _sweep(table: Table | None) -> dict[str, float] | None:
     return None if columns is None else percentiles_ms(columns[0][columns[0] > 0.0])
 
 
-def _losses(counters: Mapping[str, str] | None, pace: Table | None) -> dict[str, int | None]:
+def _losses(
+    counters: Mapping[str, str] | None, pace: Table | None, notes: list[str]
+) -> dict[str, int | None]:
     """Late ticks as the plant has marked them, rows that did not reach the recorder by its own count."""
     late = None if pace is None else _columns(pace, PACE)
-    lost = (counters or {}).get("ticks_lost", "")
     return {
         "late_ticks": None if late is None else int(np.count_nonzero(late[0] > 0.0)),
-        "rows_lost": int(lost) if lost.isdecimal() else None,
+        "rows_lost": total_of(counters, "ticks_lost", notes),
     }
 
 
@@ -253,24 +266,26 @@ def _events(found: Survey, run: RunConfig | None, notes: list[str]) -> list[dict
     for payload in (count and count.payloads) or []:
         try:
             event = msgspec.json.decode(payload, type=dict[str, Any])
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             notes.append(f"an event cannot be read: {error}")
             continue
         level = event.get("level")
         tick = event.get("tick")
+        if tick is not None and not (type(tick) is int and 0 <= tick <= LAST_TICK):
+            notes.append(f"an event has the tick {shown(tick)}, which no run has")
+            tick = None
         out.append(
             {
                 "tick": tick,
-                "time_s": tick * run.tick_s if run and isinstance(tick, int) else None,
-                "level": level_name(level) if isinstance(level, int) else level,
-                "name": event.get("name"),
-                "message": event.get("message"),
+                "time_s": tick * run.tick_s if run and tick is not None else None,
+                "level": level_name(level) if isinstance(level, int) else _text(level),
+                "name": _text(event.get("name")),
+                "message": _text(event.get("message")),
             }
         )
     return out
 
 
-def _ended(events: Iterable[Mapping[str, Any]]) -> str | None:
-    """How the run ended; None if it does not say."""
-    names = [event["name"] for event in events if event["name"] in ENDINGS]
-    return names[-1] if names else None
+def _text(value: object) -> str | None:
+    """A text of an event; anything else that stands there in short."""
+    return value if value is None or isinstance(value, str) else shown(value)

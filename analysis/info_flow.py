@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import msgspec
-
+from analysis.recorded_counters import counts_of, number_of
 from wire.channels import label
+from wire.errors import UsageError
 from wire.run_config import RunConfig
 
 KINDS = {
@@ -33,10 +33,22 @@ def counters_of(counters: Mapping[str, str], process: str, notes: list[str]) -> 
     if text is None:
         return {}
     try:
-        return msgspec.json.decode(text, type=dict[str, int])
-    except msgspec.DecodeError as error:
+        return counts_of(text)
+    except UsageError as error:
         notes.append(f"the counters of {process} cannot be read: {error}")
         return {}
+
+
+def total_of(counters: Mapping[str, str] | None, name: str, notes: list[str]) -> int | None:
+    """A total of the recorder; None without it, or if it cannot be read, which is added to the notes."""
+    text = (counters or {}).get(name)
+    if text is None:
+        return None
+    try:
+        return number_of(text)
+    except UsageError as error:
+        notes.append(f"the counter {name} cannot be read: {error}")
+        return None
 
 
 def message_kinds(
@@ -50,7 +62,8 @@ def message_kinds(
         return None
     nodes = [counters_of(counters, f"node/{label(i, run.nodes)}", notes) for i in range(run.nodes)]
     plant = counters_of(counters, "plant", notes)
-    sweeps = _number(counters, "ticks_recorded") - _number(counters, "late_ticks")
+    ticks, late = (total_of(counters, name, notes) for name in ("ticks_recorded", "late_ticks"))
+    sweeps = (ticks or 0) - (late or 0)
     out: dict[str, Any] = {}
     for kind, name in KINDS.items():
         rows = [*nodes, plant] if kind == "telemetry" else nodes
@@ -116,8 +129,3 @@ def _kind(messages: int, size: int | None, sweeps: int) -> dict[str, Any]:
         "bytes": size,
         "per_tick": messages / sweeps if sweeps > 0 else None,
     }
-
-
-def _number(counters: Mapping[str, str], name: str) -> int:
-    text = counters.get(name, "")
-    return int(text) if text.isdecimal() else 0

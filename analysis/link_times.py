@@ -11,14 +11,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from analysis.info_health import flags_of
 from analysis.table import Table
-from wire.channels import label
+from wire.channels import Degraded, label
 from wire.errors import UsageError
 from wire.link_latency import CLOCKS, IN_MEMORY, MESSAGES, Array, link_kinds, link_latencies
 from wire.run_config import RunConfig
 
 SHARES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 WORST_BY = "p99"
+_NOT_CAME = (Degraded.MEASUREMENT_HELD, Degraded.FORWARD_BRIDGED, Degraded.BACKWARD_BRIDGED)
 _INSTANTS = tuple(f"{what}_received_wall_ns" for what in ("measurement", "forward", "backward"))
 
 
@@ -32,7 +34,10 @@ def link_facts(
     """
     own = own_clocks(facts.get("hosts"), run.nodes, notes)
     kinds = link_kinds(run.nodes, run.firsts, own)
-    y, c, d = (_instants(tables, run, field) for field in _INSTANTS)
+    y, c, d = (
+        _instants(tables, run, field, flag)
+        for field, flag in zip(_INSTANTS, _NOT_CAME, strict=True)
+    )
     found = link_latencies(y, c, d)
     rows: list[dict[str, Any]] = []
     pooled: dict[str, Any] = {}
@@ -70,9 +75,10 @@ def own_clocks(hosts: str | None, nodes: int, notes: list[str]) -> frozenset[int
     own: set[int] = set()
     first = 0
     for place in places:
+        end = min(first + place.nodes, nodes)
         if place.own_clock:
-            own.update(range(first, first + place.nodes))
-        first += place.nodes
+            own.update(range(first, end))
+        first = end
     return frozenset(own)
 
 
@@ -83,8 +89,9 @@ class _Place(msgspec.Struct):
     own_clock: bool
 
 
-def _instants(tables: Mapping[str, Table], run: RunConfig, field: str) -> Array:
-    """(K, n): one instant of every node at every tick that any of them has recorded; NaN where missing."""
+def _instants(tables: Mapping[str, Table], run: RunConfig, field: str, not_came: Degraded) -> Array:
+    """(K, n): one instant of every node at every tick that any of them has recorded; NaN where missing, or
+    where nothing arrived: then the instant is that at which it was given up."""
     timing = [tables.get(f"/node/{label(i, run.nodes)}/timing") for i in range(run.nodes)]
     ticks = max((int(one.ticks.max()) + 1 for one in timing if one is not None), default=0)
     ticks = min(max(ticks, 0), run.ticks)  # a message without a checksum may say anything
@@ -96,6 +103,8 @@ def _instants(tables: Mapping[str, Table], run: RunConfig, field: str) -> Array:
             out[:, i] = table.by_tick((field,), ticks)[:, 0]
         except UsageError:
             continue
+        flags = flags_of(tables, i, run.nodes)[:ticks]
+        out[: flags.size][(flags & int(not_came)) != 0, i] = np.nan
     return out
 
 

@@ -13,12 +13,12 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import lz4.frame
 import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
-from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
 
 from wire.errors import UsageError
 
@@ -28,6 +28,9 @@ FRAME = struct.Struct("<BQ")
 Message = tuple[int, int, int, int, int, memoryview]
 """Offset of its record in the unpacked chunk, channel number, sequence, log time, publish time, payload. A
 plain tuple: there are hundreds of thousands."""
+LARGEST_CHUNK = 1 << 26
+"""Bytes in a chunk; the recorder's have a quarter of a megabyte. A kilobyte of zstd may claim any number, and
+unpack to gigabytes."""
 Announcement: TypeAlias = Schema | Channel
 DECODING = (McapError, UnicodeDecodeError, struct.error, OverflowError, MemoryError)
 """What the functions here raise for a record that cannot be read."""
@@ -114,6 +117,8 @@ def split(inside: memoryview) -> tuple[list[Announcement], list[Message], bool]:
             messages.append((offset, *_MESSAGE.unpack_from(inside, begin), payload))
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             announced.append(decoded(opcode, inside[begin:end]))
+        elif opcode == 0:  # millions of zeros would be millions of records
+            raise McapError("a record of kind 0, which there is not")
         offset = end
     return announced, messages, offset < size
 
@@ -129,12 +134,27 @@ def chunk_of(content: memoryview) -> Chunk:
 def unpacked(chunk: Chunk) -> memoryview:
     """The records in a chunk; McapError if it cannot be unpacked or its checksum does not fit."""
     try:
-        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-    except CRCValidationError:
-        raise McapError("a chunk whose checksum does not fit") from None
+        inside = _unpack(chunk.compression, chunk.data)
     except Exception as error:  # each compression library has exceptions of its own
         raise McapError(f"a chunk that cannot be unpacked: {error}") from None
-    return memoryview(stream.read(size))
+    if len(inside) > LARGEST_CHUNK:
+        raise McapError(f"a chunk that holds more than {LARGEST_CHUNK} bytes")
+    if chunk.uncompressed_crc and zlib.crc32(inside) != chunk.uncompressed_crc:
+        raise McapError("a chunk whose checksum does not fit")
+    return memoryview(inside)
+
+
+def _unpack(compression: str, data: bytes | memoryview) -> bytes:
+    """The bytes of packed data, up to the limit and one more; what it claims of its size is not believed."""
+    most = LARGEST_CHUNK + 1
+    if compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+            return reader.read(most)
+    if compression == "lz4":
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most))
+    if compression == "":
+        return bytes(data[:most])
+    raise McapError(f"compression {compression[:20]!r} is not known")
 
 
 def begun(content: memoryview) -> memoryview:
@@ -149,7 +169,7 @@ def begun(content: memoryview) -> memoryview:
         (wanted,) = _CHUNK_DATA.unpack_from(content, at)
         data = content[at + _CHUNK_DATA.size :][:wanted]
         if compression == b"zstd":
-            return memoryview(zstandard.ZstdDecompressor().decompressobj().decompress(data))
+            return memoryview(_unpack("zstd", data)[:LARGEST_CHUNK])
     except (struct.error, zstandard.ZstdError):
         return memoryview(b"")
     return data if compression == b"" else memoryview(b"")

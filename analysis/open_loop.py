@@ -118,13 +118,24 @@ def estimation_errors(recording: Recording, estimates: Array) -> EstimationError
     )
 
 
+def known_commands(recording: Recording) -> tuple[Array, int]:
+    """The recorded commands (K, n) and how many of them were lost; for these the last known ones stand."""
+    commands = recording.commands.copy()
+    lost = ~np.isfinite(commands)
+    commands[0, lost[0]] = recording.initial_commands[lost[0]]
+    for k in 1 + np.flatnonzero(lost[1:].any(axis=1)):
+        commands[k, lost[k]] = commands[k - 1, lost[k]]
+    return commands, int(np.count_nonzero(lost))
+
+
 def compare_with_open_loop(recording: Recording) -> tuple[EstimationErrors, EstimationErrors]:
     """Errors over time of the recorded observer and of the open-loop model, in this order."""
+    commands, _ = known_commands(recording)
     model = open_loop_run(
         recording.deployment.dense,
         active_setpoints(recording),
         recording.references.states,
         recording.initial_estimates,
-        recording.commands,
+        commands,
     )
     return estimation_errors(recording, recording.estimates), estimation_errors(recording, model)

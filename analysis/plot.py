@@ -24,7 +24,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from analysis.goals import active_setpoints
 from analysis.panels import PANELS, SUMMARY
-from analysis.panels.frame import Cell, key_of_marks, missing_ticks, ticks_in_words
+from analysis.panels.frame import Cell, bridged_ticks, key_of_marks, missing_ticks, ticks_in_words
 from analysis.recording import Recording, find_recording, read_recording
 from analysis.whole_file import check_free, whole
 from wire.errors import UsageError
@@ -168,6 +168,7 @@ def plot_file(
         "ticks": recording.ticks,
         "late_ticks": int(recording.late.sum()),
         "ticks_not_recorded": missing_ticks(recording),
+        "ticks_bridged": int(np.count_nonzero(bridged_ticks(recording))),
         "width_in": wide,
         "height_in": tall,
         "dpi": choice.dpi,

@@ -14,8 +14,9 @@ import msgspec
 from analysis.recording import Recording
 from deploy.node_configs import node_configs
 from wire.channels import NODES_ATTACHMENT
+from wire.config_json import loads
 from wire.errors import UsageError
-from wire.run_config import LinkConfig, NodeConfig, loads
+from wire.run_config import LinkConfig, NodeConfig
 
 _DEADLINE_S = 5.0
 

@@ -6,58 +6,60 @@ artefact (attached), the counters, and one channel per kind of message and node 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from analysis.mcap_file import McapContent, read_mcap
-from analysis.table import Table, decode_table
-from deploy import Deployment, SegmentGrid, deploy
+from analysis.events import check_events, ending_among
+from analysis.mcap_file import read_mcap
+from analysis.recorded_commands import in_force
+from analysis.recorded_counters import counts_of, number_of
+from analysis.recorded_format import (
+    attached_artefact,
+    check_setpoints,
+    check_version,
+    common_ticks,
+    not_ours,
+)
+from analysis.recorded_links import Link, links_between
+from analysis.table import Table, check_numbers, check_ticks, decode_table, whole_numbers
+from deploy import Deployment, deploy
+from deploy.grid import make_grid
 from deploy.path import References, make_references
-from wire.artefact import FORMAT as GAINS_FORMAT
-from wire.artefact import GainsArtefact, parse_artefact
+from wire.artefact import GainsArtefact
 from wire.channels import (
     COMMAND,
+    DEGRADED,
+    ENERGY,
+    GUARD,
     MEASUREMENT,
     METADATA,
     PACE,
-    READABLE,
     SHAPE,
     SHAPE_POINTS,
     STATE,
     SUMMARY,
+    WELL,
+    Degraded,
+    Health,
     label,
 )
-from wire.errors import UsageError
+from wire.config_json import loads
+from wire.errors import UsageError, about
 from wire.foxglove import EVENTS
-from wire.run_config import RunConfig, loads
+from wire.run_config import RunConfig
 
 Array = npt.NDArray[np.float64]
 
 QUANTITIES = (*STATE, *COMMAND)
 """What a node computes each tick, in the order of the dense step's output."""
-_FLOW = ("messages", "bytes", "crc32")
-ENDINGS = ("finished", "interrupted", "safety_stop")
-"""Names of the events that say how a run ended."""
-
-
-@dataclass(frozen=True)
-class Link:
-    """One direction between two neighbours, by the final counters of both."""
-
-    way: str
-    """"forward" or "backward"."""
-    sender: int
-    receiver: int
-    sent: int
-    received: int
-    intact: bool
-    """Both ends agree in number, bytes and checksum."""
+_OF_NUMBERS = ("/node/", "/plant/", "/sweep/")
+"""Channels whose fields are all numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +83,11 @@ class Recording:
     """By name, byte for byte."""
     order: Sequence[str] = ()
     """The topic of every message, in the order of the file."""
+
+    @property
+    def format_version(self) -> int:
+        """One of `wire.channels.READABLE`."""
+        return int(self.facts["format_version"])
 
     @property
     def complete(self) -> bool:
@@ -134,11 +141,68 @@ class Recording:
 
     @cached_property
     def commands(self) -> Array:
-        """u_i(k): transverse load in N/m, (K, n); in late ticks those that were held."""
-        commands = self.of_nodes("command", COMMAND)[:, :, 0]
-        for k in np.flatnonzero(self.late):
-            commands[k] = commands[k - 1]
-        return commands
+        """u_i(k): transverse load in N/m, (K, n); where a node has told none because it had none to tell, what
+        the plant left in force (`analysis.recorded_commands`). NaN where rows were lost."""
+        run, used = self.configuration, self.setpoints_used
+        rests = np.stack([node.initial_command for node in self.deployment.nodes], axis=1)
+        return in_force(
+            told=self.of_nodes("command", COMMAND)[:, :, 0],
+            late=self.late,
+            on_time=self.health_says(Health.ON_TIME),
+            alive=self.health_says(Health.ALIVE),
+            rest=rests[np.where(used >= 0, used, run.setpoint_index)],
+            fade=math.exp(-run.tick_s / run.scheduling.bump_s),
+        )
+
+    @cached_property
+    def flags(self) -> npt.NDArray[np.int64]:
+        """(K, n) wire.channels.Degraded of each node's tick; 0 where there is no row, and before version 5."""
+        if self.format_version < 5:
+            return np.zeros((self.ticks, self.nodes), dtype=np.int64)
+        return whole_numbers(self.of_nodes("degraded", DEGRADED)[:, :, 0], 0.0)
+
+    @cached_property
+    def health(self) -> npt.NDArray[np.int64]:
+        """(plant ticks, n) wire.channels.Health in every tick of the plant, which may have more than K; all is
+        well where it did not say."""
+        fields = [f"node_{self._label(i)}" for i in self._indices]
+        return whole_numbers(self._whole_plant("/plant/health", fields), float(WELL))
+
+    def health_says(self, what: Health) -> npt.NDArray[np.bool_]:
+        """(K, n) one of the three things that the plant knows of a node."""
+        return np.asarray((self.health[: self.ticks] & int(what)) != 0)
+
+    @cached_property
+    def passive(self) -> npt.NDArray[np.bool_]:
+        """(plant ticks,) whether the arm was under static loads only."""
+        return np.asarray(self._whole_plant("/plant/guard", GUARD)[:, 0] > 0.0)
+
+    @cached_property
+    def energy_above_loads_j(self) -> Array:
+        """(plant ticks,) kinetic, axial and bending energy and potential of the loads; NaN before version 5.
+
+        Without motion of the loads and without disturbance only damping changes it.
+        """
+        energy = self._whole_plant("/plant/energy", ENERGY).sum(axis=1)
+        return np.asarray(energy + self._whole_plant("/plant/guard", GUARD)[:, 1])
+
+    @cached_property
+    def out(self) -> npt.NDArray[np.bool_]:
+        """(K, n) ticks with a sweep of which a node has no row, and had nothing to record: it was out."""
+        told = np.isfinite(self.estimates).all(axis=2)
+        return np.asarray(~told & ~self.late[:, None] & ~self.health_says(Health.ON_TIME))
+
+    @property
+    def first_degraded(self) -> int | None:
+        """The first tick in which the chain was not whole: a sum was bridged, a command held, a node out."""
+        found = np.flatnonzero((self.flags != 0).any(axis=1) | self.out.any(axis=1))
+        return int(found[0]) if found.size else None
+
+    @cached_property
+    def replaced(self) -> dict[int, int]:
+        """How often each node was replaced, of those that were."""
+        times = np.count_nonzero(self.flags & int(Degraded.JOINED), axis=0)
+        return {node: int(count) for node, count in enumerate(times) if count}
 
     @cached_property
     def truth(self) -> Array:
@@ -190,94 +254,86 @@ class Recording:
 
     @cached_property
     def deployment(self) -> Deployment:
-        """The sweep factors and dense steps, computed anew from artefact and configuration."""
+        """The sweep factors and dense steps, computed anew from artefact and configuration.
+
+        Raises UsageError if the gains cannot be put on this arm.
+        """
         run = self.configuration
-        deployment = deploy(self.artefact, run.nodes, run.tick_s, run.faces_m)
+        with about(f"recording {self.path}"):
+            deployment = deploy(self.artefact, run.nodes, run.tick_s, run.faces_m)
         return deployment if run.control else deployment.without_control()
 
     @cached_property
     def references(self) -> References:
         """What nodes and plant should have done at each tick, computed anew like `deployment`."""
         run = self.configuration
-        grid = SegmentGrid(np.asarray(run.faces_m))
-        return make_references(
-            self.artefact, grid, run.tick_s, run.setpoint, run.first_hold_s, run.legs
-        )
+        with about(f"recording {self.path}"):
+            grid = make_grid(self.artefact.arm.length_m, run.nodes, run.faces_m)
+            return make_references(
+                self.artefact, grid, run.tick_s, run.setpoint, run.first_hold_s, run.legs
+            )
 
     @cached_property
     def setpoints_used(self) -> npt.NDArray[np.int64]:
-        """(K,) index of the setpoint whose gains the root node uses; -1 where that was not recorded."""
+        """(K,) index of the setpoint whose gains the root node uses; -1 where that was not recorded.
+
+        Raises UsageError for a setpoint that there is not.
+        """
         table = self.table(f"/node/{self._label(0)}/schedule")
         used = table.by_tick(("setpoint",), self.ticks)[:, 0]
-        return np.where(np.isfinite(used), used, -1.0).astype(np.int64)
+        used = np.where(np.isfinite(used), used, -1.0)
+        count = len(self.configuration.setpoint_names)
+        if used.size and not -1.0 <= used.min() <= used.max() < count:
+            raise UsageError(
+                f"recording {self.path}: channel {table.topic}, field 'setpoint': expected 0..{count - 1}; it "
+                "was edited"
+            )
+        return used.astype(np.int64)
 
     def counter(self, name: str) -> int | None:
         """A total of the final counters (docs/recording.md); None if the recorder wrote none."""
         text = (self.counters or {}).get(name)
         if text is None:
             return None
-        try:
-            return int(text)
-        except ValueError:
-            raise UsageError(
-                f"recording {self.path}: counter {name} is {text[:40]!r}, not a number"
-            ) from None
+        with about(f"recording {self.path}: counter {name}"):
+            return number_of(text)
 
     def process_counters(self, process: str) -> dict[str, int]:
         """The final counters of "plant", "recorder" or "node/NN"; empty if it sent none."""
         text = (self.counters or {}).get(process)
         if text is None:
             return {}
-        try:
-            return msgspec.json.decode(text, type=dict[str, int])
-        except msgspec.DecodeError as error:
-            raise UsageError(f"recording {self.path}: counters of {process}: {error}") from None
+        with about(f"recording {self.path}: counters of {process}"):
+            return counts_of(text)
 
     def total(self, name: str) -> int | None:
         """A counter summed over all nodes; None unless every node has sent its counters."""
-        counts = [self.process_counters(f"node/{self._label(i)}") for i in self._indices]
-        if not all(counts):
-            return None
-        return sum(one.get(name, 0) for one in counts)
+        counts = self._node_counters()
+        return None if counts is None else sum(one.get(name, 0) for one in counts)
 
     def links(self) -> list[Link] | None:
         """Directed links between neighbours in different processes, forward ones first, each from the root on.
 
         None unless every node has sent its counters.
         """
-        counts = [self.process_counters(f"node/{self._label(i)}") for i in self._indices]
-        if not all(counts):
-            return None
-        pairs = [("forward", i, i + 1) for i in range(self.nodes - 1)]
-        pairs += [("backward", i + 1, i) for i in range(self.nodes - 1)]
-        return [
-            Link(
-                way,
-                a,
-                b,
-                counts[a][f"{way}_sent_messages"],
-                counts[b].get(f"{way}_received_messages", 0),
-                all(
-                    counts[a][f"{way}_sent_{what}"] == counts[b].get(f"{way}_received_{what}")
-                    for what in _FLOW
-                ),
-            )
-            for way, a, b in pairs
-            if f"{way}_sent_messages" in counts[a]  # else both are in one process
-        ]
+        counts = self._node_counters()
+        return None if counts is None else links_between(counts, set(self.replaced))
 
     def intact_links(self) -> int | None:
         """Links whose two ends saw the same bytes in the same order.
 
-        2 (n - 1) if everything that was sent arrived unaltered (with p processes 2 (p - 1)); None unless every
-        node has sent its counters.
+        2 (n - 1) if everything that was sent arrived unaltered (with p processes 2 (p - 1)), less the links of
+        processes that were replaced; None unless every node has sent its counters.
         """
         links = self.links()
-        return None if links is None else sum(link.intact for link in links)
+        return None if links is None else sum(link.intact and link.whole for link in links)
 
     def sweeps(self) -> int | None:
-        """Ticks that had a sweep, by the final counters; None unless every node has sent its own."""
+        """Ticks that had a sweep, by the final counters; None unless every node has sent its own, and if the
+        recording ends before the run does."""
         done = self.counter("ticks_recorded")
+        if (self.counter("disk_full_at") or -1) >= 0:
+            return None
         if done is None or self.counter("nodes_reporting") != self.nodes:
             return None
         return done - (self.counter("late_ticks") or 0)
@@ -287,8 +343,23 @@ class Recording:
         table = self.tables.get(EVENTS.topic)
         if table is None or not table.rows:
             return None
-        names = [name for name in table.column("name") if name in ENDINGS]
-        return names[-1] if names else None
+        return ending_among(table.column("name"))
+
+    def _node_counters(self) -> list[dict[str, int]] | None:
+        """The final counters of every node; None unless all have sent theirs."""
+        counts = [self.process_counters(f"node/{self._label(i)}") for i in self._indices]
+        return counts if all(counts) else None
+
+    def _whole_plant(self, topic: str, fields: Sequence[str]) -> Array:
+        """Fields of the plant in all of its ticks, (plant ticks, fields); NaN if there is no such channel."""
+        own = self.table("/plant/pace")
+        ticks = max(self.ticks, int(own.ticks.max()) + 1 if own.rows else 0)
+        table = self.tables.get(topic)
+        return (
+            np.full((ticks, len(fields)), np.nan)
+            if table is None or not table.rows
+            else table.by_tick(fields, ticks)
+        )
 
     @property
     def _indices(self) -> range:
@@ -321,69 +392,22 @@ def read_recording(path: Path) -> Recording:
     if "run" not in facts:
         raise UsageError(f"recording {path}: no run configuration in its metadata; it was edited")
     configuration = loads(RunConfig, facts["run"], f"recording {path}: run configuration")
-    try:
-        tables = {topic: decode_table(topic, rows) for topic, rows in content.payloads.items()}
-    except UsageError as error:
-        raise UsageError(f"recording {path}: {error}") from None
+    where = f"recording {path}: "
+    tables = {topic: decode_table(topic, rows, where) for topic, rows in content.payloads.items()}
+    check_ticks(tables.values())
+    check_numbers(one for topic, one in tables.items() if topic.startswith(_OF_NUMBERS))
+    check_events(tables.get(EVENTS.topic))
+    artefact = attached_artefact(content.attachments, path)
+    check_setpoints(path, configuration, artefact)
     return Recording(
         path=path,
         unfinished=content.unfinished,
         configuration=configuration,
-        artefact=_artefact(content, path),
+        artefact=artefact,
         facts=facts,
         counters=content.metadata.get(SUMMARY),
         tables=tables,
-        ticks=_common_ticks(tables, configuration),
+        ticks=common_ticks(tables, configuration.nodes),
         order=content.order,
         attachments=content.attachments,
     )
-
-
-def check_version(path: Path, facts: Mapping[str, str]) -> None:
-    """UsageError unless the metadata of octarm say a format version that is read."""
-    version = facts.get("format_version", "")
-    if version not in map(str, READABLE):
-        raise UsageError(
-            f"recording {path}: expected format version {' or '.join(map(str, READABLE))}, got "
-            f"{version or 'none'}; read it with the octarm that wrote it, or a newer one"
-        )
-
-
-def not_ours(path: Path, stops: str | None, topics: Iterable[str]) -> str:
-    """Why an MCAP file without the metadata of octarm is refused; `stops` says how it stops, if it does."""
-    if stops is not None:
-        return f"recording {path}: it {stops}, before anything of octarm; the run did not begin"
-    return (
-        f"recording {path}: an MCAP file without {METADATA!r} metadata, so not of octarm (its topics: "
-        f"{', '.join(sorted(topics)[:5]) or 'none'}); give the .mcap file that a run left behind"
-    )
-
-
-def _artefact(content: McapContent, path: Path) -> GainsArtefact:
-    """The attached gains artefact, checked as any artefact file is."""
-    for name, data in content.attachments.items():
-        if f'"{GAINS_FORMAT}"'.encode() not in data[:200]:
-            continue
-        return parse_artefact(data, f"{name} attached to recording {path}")
-    attached = ", ".join(content.attachments) or "nothing"
-    raise UsageError(
-        f"recording {path}: expected the gains artefact attached, found {attached}; "
-        "it was cut short before the run began, or edited"
-    )
-
-
-def needed_topics(nodes: int) -> list[str]:
-    """The channels that a tick must have reached to count as one of the recording."""
-    names = [label(i, nodes) for i in range(nodes)]
-    kinds = ("measurement", "estimate", "command")
-    own = [f"/node/{name}/{kind}" for name in names for kind in kinds]
-    return [*own, *(f"/plant/truth/{name}" for name in names)]
-
-
-def _common_ticks(tables: Mapping[str, Table], run: RunConfig) -> int:
-    """Ticks from 0 on that the plant and every node have reached in this file."""
-    last = []
-    for topic in needed_topics(run.nodes):
-        table = tables.get(topic)
-        last.append(-1 if table is None or not table.rows else int(table.ticks.max()))
-    return min(last) + 1

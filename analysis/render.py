@@ -6,14 +6,12 @@ Takes the dictionary of `analysis.summary`, gives text; nothing is computed here
 from __future__ import annotations
 
 from collections.abc import Sequence
-from io import StringIO
 from typing import Any
 
-from rich import box
-from rich.console import Console
-from rich.table import Table
+from analysis.folded_table import WIDTH, folded
+from analysis.refused import peers_line
+from analysis.render_degraded import degraded_rows
 
-WIDTH = 118
 LEG = (
     "leg",
     "hold",
@@ -39,16 +37,7 @@ def render(summary: dict[str, Any], width: int = WIDTH) -> str:
 
 
 def _table(head: Sequence[str], body: Sequence[Sequence[str]], width: int) -> list[str]:
-    table = Table(box=box.SIMPLE, pad_edge=False, show_edge=False, padding=(0, 2, 0, 0))
-    table.add_column(head[0], no_wrap=True)
-    for name in head[1:]:
-        table.add_column(name, overflow="fold")
-    for row in body:
-        table.add_row(*row)
-    out = StringIO()
-    console = Console(file=out, width=width, color_system=None, markup=False, highlight=False)
-    console.print(table)
-    return [line.rstrip() for line in out.getvalue().splitlines()]
+    return folded([(name, "left") for name in head], body, width)
 
 
 def report(summary: dict[str, Any]) -> str:
@@ -88,10 +77,11 @@ def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
             "wall clock, first measurement sent to last command back",
         ),
         *_pace(s),
+        *degraded_rows(s),
         (
             "difference to central",
             _number(s["max_difference_to_central"], "", 2),
-            f"relative; the same gains centrally; worst at {_where(s)}",
+            f"relative; the same gains centrally; worst at {_where(s)}{_compared(s)}",
         ),
         *_estimation(s),
         _tip(s),
@@ -107,12 +97,27 @@ def rows(s: dict[str, Any]) -> list[tuple[str, str, str]]:
         (
             "rejected messages",
             _count(s["rejected_messages"]),
-            f"malformed, stale or foreign; ticks lost by the recorder: {_count(s['ticks_lost'])}",
+            f"{_reasons(s)}; ticks lost by the recorder: {_count(s['ticks_lost'])}",
         ),
+        *_refused(s),
         ("start-up", _number(s["start_up_s"], "s", 2), "wall clock, plan to first measurement"),
         ("gains", s["artefact_sha256"][:16], "SHA-256 of the artefact, first 16 digits"),
     ]
     return out
+
+
+def _reasons(s: dict[str, Any]) -> str:
+    reasons = s["rejected_by_reason"]
+    if not reasons:
+        return "malformed, stale or foreign"
+    return ", ".join(f"{reason} {count}" for reason, count in reasons.items())
+
+
+def _refused(s: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Peers that were not let in, if any came."""
+    peers = s["refused_peers"]
+    total = sum(one["count"] for one in peers)
+    return [("refused peers", str(total), peers_line(peers))] if peers else []
 
 
 def _estimation(s: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -124,7 +129,8 @@ def _estimation(s: dict[str, Any]) -> list[tuple[str, str, str]]:
             (
                 "estimation error",
                 f"rms {_number(energy['observer'], 'J^1/2')}",
-                f"energy norm; open-loop model {_number(energy['open_loop_model'], 'J^1/2')}",
+                f"energy norm; open-loop model {_number(energy['open_loop_model'], 'J^1/2')}"
+                f"{_assumed(s)}",
             ),
             (
                 "shape estimation error",
@@ -140,7 +146,8 @@ def _estimation(s: dict[str, Any]) -> list[tuple[str, str, str]]:
         (
             "estimation error",
             _course(s["estimation_error"], "%", 100.0),
-            f"energy norm; open-loop model {_course(s['open_loop_model_error'], '%', 100.0)}",
+            f"energy norm; open-loop model {_course(s['open_loop_model_error'], '%', 100.0)}"
+            f"{_assumed(s)}",
         ),
         _below_1_percent(s, "estimation"),
         (
@@ -250,7 +257,10 @@ def _expected(s: dict[str, Any]) -> str:
     if letter == "p":
         text += f" of p = {s['node_processes']} processes"
         text += f"; in memory: {_count(s['passed_messages_per_tick'])} a tick"
-    return f"{text}; links intact: {_count(s['intact_links'])}"
+    text += f"; links intact: {_count(s['intact_links'])}"
+    if s["replaced_links"]:
+        text += f", {s['replaced_links']} more ended at a replaced process; what the dead one counted is lost"
+    return text
 
 
 def _pace(s: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -264,6 +274,22 @@ def _pace(s: dict[str, Any]) -> list[tuple[str, str, str]]:
     return [("real time", value, f"ticks whose sweep before was not over, commands held; {held}")]
 
 
+def _compared(s: dict[str, Any]) -> str:
+    """How far the comparison with the central run goes, if not to the end."""
+    facts = s["difference_to_central"]
+    tick = facts["degraded_from_tick"]
+    if tick is not None:
+        return f"; compared up to tick {tick}: from there sums were bridged"
+    if facts["ticks_compared"] < s["ticks"]:
+        return f"; compared up to tick {facts['ticks_compared'] - 1}, of which measurements are missing"
+    return ""
+
+
+def _assumed(s: dict[str, Any]) -> str:
+    count = s["open_loop_commands_assumed"]
+    return f" ({count} commands were not recorded, the last ones stand for them)" if count else ""
+
+
 def _stops(s: dict[str, Any]) -> str:
     return s["recording_stops"] or "it has no final counters"
 
@@ -272,6 +298,7 @@ def _story(s: dict[str, Any]) -> str:
     parts = [] if s["scenario"] == "hold" else [f"scenario {s['scenario']}"]
     parts += [] if len(s["legs"]) > 1 else [f"setpoint {s['setpoint']}"]
     parts += [] if s["control"] else ["no feedback"]
+    parts += [] if s["plant_model"] == "exact" else [f"plant model {s['plant_model']}"]
     return ", ".join(parts)
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from analysis.lives import Loss
 from analysis.recorded_nodes import RecordedNodes, recorded_nodes
 from analysis.recording import Recording
 from analysis.replay import (
@@ -30,11 +31,22 @@ from analysis.replay import (
     topic,
 )
 from node.row import Y
-from wire.channels import COMMAND, COMMAND_AT, MEASUREMENT, SCHEDULE, STATE, SUMS_AT, label
+from wire.channels import (
+    COMMAND,
+    COMMAND_AT,
+    DEGRADED,
+    MEASUREMENT,
+    SCHEDULE,
+    STATE,
+    SUMS_AT,
+    Degraded,
+    label,
+)
 from wire.errors import UsageError
 from wire.run_config import NodeConfig
 
 Array = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
 
 _FIELDS = (
     *(("measurement", field) for field in MEASUREMENT),
@@ -209,7 +221,7 @@ class _Part:
     """Numbers of one node in all ticks, recorded and replayed (ticks, columns)."""
 
     rank: tuple[int, int]
-    """When in a tick they are made."""
+    """When in a tick they are made; flags say something of the tick when it is over."""
     node: int
     """Which gives them."""
     fields: Sequence[tuple[str, str]]
@@ -231,32 +243,69 @@ def _parts(replayed: Replayed, rows: Rows, nodes: int, *, process: bool) -> Iter
         fields = [(topic(i, nodes, channel), field) for channel, field in _FIELDS]
         begin = 0 if process else Y
         yield _Part((0, i), i, fields[begin:], rows.of[i][:, begin:SUMS_AT], own[:, begin:SUMS_AT])
-        # Sums between segments of one process: in memory, but recorded as any other.
+        if rows.flagged:
+            said = [(topic(i, nodes, "degraded"), DEGRADED[0])]
+            flag = slice(-len(DEGRADED), None)
+            yield _Part((3, i), i, said, rows.of[i][:, flag], own[:, flag])
+        # Sums between segments of one process: in memory, but recorded as any other. And what stood for a sum
+        # that did not come has the receiver made itself.
         at = SUMS_AT + rows.forward[i]
-        if i > first or (process and i > 0):
-            yield _forward(i, rows, own[:, SUMS_AT:at], nodes)
-        if i < last or (process and i < nodes - 1):
-            yield _backward(i, rows, own[:, at : at + rows.backward[i]], nodes)
+        if i > 0:
+            every = process or i > first
+            where = None if every else _bridged(rows, i, Degraded.FORWARD_BRIDGED)
+            yield _forward(i, rows, own[:, SUMS_AT:at], nodes, i - 1 if every else i, where)
+        if i < nodes - 1:
+            every = process or i < last
+            where = None if every else _bridged(rows, i, Degraded.BACKWARD_BRIDGED)
+            end = at + rows.backward[i]
+            yield _backward(i, rows, own[:, at:end], nodes, i + 1 if every else i, where)
     if last < nodes - 1:
-        yield _forward(last + 1, rows, replayed.forward, nodes)
+        came = ~_bridged(rows, last + 1, Degraded.FORWARD_BRIDGED)
+        yield _forward(last + 1, rows, replayed.forward, nodes, last, came)
+        if rows.flagged:
+            name = [(topic(last + 1, nodes, "degraded"), DEGRADED[0])]
+            flags = (rows.flags(last + 1) & int(Degraded.PARTIAL)).astype(np.float64)[:, None]
+            heard = _only(flags, came & rows.whole[last + 1])
+            yield _Part((3, last + 1), last, name, heard, replayed.partial)
     if first > 0:
-        yield _backward(first - 1, rows, replayed.backward, nodes)
-    if process:  # what was sent is the command of the next tick, unless that one is late
+        came = ~_bridged(rows, first - 1, Degraded.BACKWARD_BRIDGED)
+        yield _backward(first - 1, rows, replayed.backward, nodes, first, came)
+    if (
+        process
+    ):  # what was sent is the command of the next tick, unless that one is late, or a replacement's
+        begins = _bridged(rows, first, Degraded.JOINED)
         for column, i in enumerate(segments):
             sent = np.full((rows.ticks, 1), np.nan)
             sent[1:, 0] = replayed.commands[: rows.ticks - 1, column]
+            sent[begins] = np.nan
             recorded = rows.of[i][:, COMMAND_AT : COMMAND_AT + 1]
             yield _Part((0, i), i, [(topic(i, nodes, "command"), COMMAND[0])], recorded, sent)
 
 
-def _forward(receiver: int, rows: Rows, ours: Array, nodes: int) -> _Part:
+def _bridged(rows: Rows, node: int, flag: Degraded) -> Bools:
+    """(ticks,) where a node's row has this flag."""
+    return np.asarray((rows.flags(node) & int(flag)) != 0)
+
+
+def _forward(
+    receiver: int, rows: Rows, ours: Array, nodes: int, giver: int, where: Bools | None
+) -> _Part:
     name = topic(receiver, nodes, "forward_sum")
-    return _Part((1, receiver), receiver - 1, _sum(name, rows), rows.forward_sum(receiver), ours)
+    recorded = _only(rows.forward_sum(receiver), where)
+    return _Part((1, receiver), giver, _sum(name, rows), recorded, ours)
 
 
-def _backward(receiver: int, rows: Rows, ours: Array, nodes: int) -> _Part:
+def _backward(
+    receiver: int, rows: Rows, ours: Array, nodes: int, giver: int, where: Bools | None
+) -> _Part:
     name = topic(receiver, nodes, "backward_sum")
-    return _Part((2, -receiver), receiver + 1, _sum(name, rows), rows.backward_sum(receiver), ours)
+    recorded = _only(rows.backward_sum(receiver), where)
+    return _Part((2, -receiver), giver, _sum(name, rows), recorded, ours)
+
+
+def _only(values: Array, where: Bools | None) -> Array:
+    """The values at these ticks, NaN at the others."""
+    return values if where is None else np.where(where[:, None], values, np.nan)
 
 
 def _sum(name: str, rows: Rows) -> list[tuple[str, str]]:
@@ -275,8 +324,7 @@ def _missing(story: Story, feeds: Sequence[Feed], replays: Sequence[Replayed]) -
     for feed, replayed in zip(feeds, replays, strict=True):
         if replayed.ended is not None:
             yield replayed.ended
-        elif (why := _unknown(story, feed, last)) is not None:
-            upto = f"replayed up to tick {feed.ticks[-1]}" if feed.ticks else "not replayed"
+        for upto, why in _unknown(story, feed, last):
             same.setdefault(f"{upto}; {why}", []).append(name_of(feed.config))
     for text, (first, *more) in same.items():
         yield f"{first}{f' and {len(more)} more' if more else ''}: {text}"
@@ -284,29 +332,53 @@ def _missing(story: Story, feeds: Sequence[Feed], replays: Sequence[Replayed]) -
     for config in story.nodes.configs:  # whose rows have the sums that these gave
         near = {config.index - 1, config.last + 1} & {i for f in feeds for i in f.segments}
         if near and config.index not in fed:
-            why = _unknown(story, story.feed(config), last)
-            if why is not None:
+            for _, why in _unknown(story, story.feed(config), last):
                 yield f"{name_of(config)}, which got its sums: {why}, so not all of them can be compared"
     if not any(feed.ticks for feed in feeds):
         yield "there is no tick of which a node has recorded everything"
 
 
-def _unknown(story: Story, feed: Feed, last: int) -> str | None:
-    """Why a process stops before tick `last`; None if it does not, or that is its end."""
-    recording = story.recording
-    if feed.stops > last and story.span.last is not None:
-        return None
-    if feed.lost:
-        return f"telemetry of tick {feed.stops} was lost, and with it the state of {feed.lost} later ticks"
-    if recording.unfinished is not None:
-        return None  # said once for all
+def _unknown(story: Story, feed: Feed, last: int) -> Iterator[tuple[str, str]]:
+    """How far a process is replayed, and why not up to tick `last`; nothing if it is, or that is its end."""
+    recording, lives = story.recording, feed.lives
+    losses = [loss for loss in lives.losses if loss.first <= last]
+    if losses and not (losses[-1].later or losses[-1].dead):
+        losses.pop()  # or it just had not got so far when the run ended: its last word tells
+    for loss in losses:
+        yield _lost(feed, loss)
+    if losses and losses[-1].later:
+        return  # its last word has nothing to add
+    if (feed.stops > last and story.span.last is not None) or recording.unfinished is not None:
+        return  # said once for all
+    upto = f"replayed up to tick {feed.ticks[-1]}" if feed.ticks else "not replayed"
     counters = recording.process_counters(f"node/{label(feed.config.index, recording.nodes)}")
+    if not counters and not story.rows.alive[-1:, feed.config.index].all():
+        return  # it was dead to the end: nothing followed
     if not counters:
-        return "it sent no last word, and whether more followed is not known"
-    done = counters.get("command_sent_messages", 0)
-    if done > len(feed.ticks):
-        return f"telemetry of {done - len(feed.ticks)} ticks after that was lost"
-    return None
+        yield upto, "it sent no last word, and whether more followed is not known"
+        return
+    # Counters are those of the last process, which sends no command in a tick that it gives up.
+    own = lives.lives[-1].ticks if lives.lives else ()
+    sent = sum(not feed.flags[k] & int(Degraded.HELD) for k in own)
+    if (done := counters.get("command_sent_messages", 0)) > sent:
+        yield upto, f"telemetry of {done - sent} ticks after that was lost"
+
+
+def _lost(feed: Feed, loss: Loss) -> tuple[str, str]:
+    """Rows that are not there."""
+    before = [k for k in feed.ticks if k < loss.first]
+    upto = f"replayed up to tick {before[-1]}" if before else "not replayed"
+    if loss.dead and not loss.later:
+        ticks = _span(loss.first, loss.last)
+        after = next((k for k in feed.ticks if k > loss.last), None)
+        again = "" if after is None else f" and from tick {after} on"
+        return f"{upto}{again}", f"telemetry of {ticks} was lost with the process that died"
+    why = f"telemetry of tick {loss.first} was lost, and with it the state of {loss.later} later ticks"
+    return upto, why
+
+
+def _span(first: int, last: int) -> str:
+    return f"tick {first}" if first == last else f"ticks {first} to {last}"
 
 
 def _bits(values: Array) -> npt.NDArray[np.int64]:

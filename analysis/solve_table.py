@@ -8,14 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from io import StringIO
-from typing import Any, Literal
+from typing import Any
 
-from rich import box
-from rich.console import Console
-from rich.table import Table
+from analysis.folded_table import WIDTH, Column, folded
 
-WIDTH = 118
 _GAMMA = {
     "gain": "no disturbance is amplified more, in the regulated outputs: proven",
     "observer": "no disturbance is amplified more, in the error of the estimated outputs: proven",
@@ -39,7 +35,6 @@ _PARTS = {
     "solver": "solver",
     "verification": "verification",
 }
-Column = tuple[str, Literal["left", "right"]]
 
 
 def answer_table(facts: dict[str, Any], width: int = WIDTH) -> str:
@@ -75,15 +70,7 @@ def suite_table(suite: dict[str, Any], width: int = WIDTH) -> str:
 def _table(
     columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int, gap: int = 2
 ) -> str:
-    table = Table(box=box.SIMPLE, pad_edge=False, show_edge=False, padding=(0, gap, 0, 0))
-    for number, (name, justify) in enumerate(columns):
-        table.add_column(name, justify=justify, no_wrap=number == 0, overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    out = StringIO()
-    console = Console(file=out, width=width, color_system=None, markup=False, highlight=False)
-    console.print(table)
-    return "\n".join(line.rstrip() for line in out.getvalue().rstrip().splitlines())
+    return "\n".join(folded(columns, rows, width, gap=gap))
 
 
 # One answer

@@ -7,7 +7,6 @@ figure that the recording does not hold (a run cut short has no counters) is nul
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,14 +14,17 @@ from typing import Any
 import numpy as np
 
 from analysis.central import CentralComparison, compare_with_central
+from analysis.degraded import degraded_facts
 from analysis.goals import active_setpoints, visited
 from analysis.legs import leg_facts, make_legs, switch_facts
 from analysis.linear import LinearDecay, linear_decay
 from analysis.metrics import control_effort, time_below
-from analysis.open_loop import ErrorCourse, compare_with_open_loop
+from analysis.open_loop import ErrorCourse, compare_with_open_loop, known_commands
 from analysis.recording import Recording, read_recording
+from analysis.refused import refused_peers, rejected_by_reason
 from analysis.render import render
 from wire.artefact import Certificate
+from wire.config_json import finite
 from wire.errors import UsageError
 
 __all__ = ["render", "summarise", "summary_of"]
@@ -74,6 +76,7 @@ def summary_of(recording: Recording) -> dict[str, Any]:
         "tick_s": run.tick_s,
         "scenario": run.scenario,
         "control": run.control,
+        "plant_model": run.plant_model,
         "actuator": recording.artefact.arm.actuator,
         "setpoint": run.setpoint,
         "initial": run.initial,
@@ -81,6 +84,7 @@ def summary_of(recording: Recording) -> dict[str, Any]:
         **_traffic(recording),
         "sweep_ms": _percentiles(durations),
         "realtime": _realtime(recording),
+        "degraded": degraded_facts(recording),
         "start_up_s": _start_up(recording),
         "max_difference_to_central": central.worst.relative,
         "difference_to_central": _central(central),
@@ -88,6 +92,7 @@ def summary_of(recording: Recording) -> dict[str, Any]:
         "estimation_error_root_joule": _ends(observer.energy.norm),
         "estimation_rms_root_joule": _both(_rms, observer.energy, model.energy),
         "open_loop_model_error": _ends(model.energy.relative),
+        "open_loop_commands_assumed": known_commands(recording)[1],
         **_below_1_percent("estimation", observer.energy, model.energy),
         "estimation_decay_per_s": {
             "observer": observer.energy.decay_per_s,
@@ -122,18 +127,7 @@ def summary_of(recording: Recording) -> dict[str, Any]:
         "recording_complete": recording.complete,
         "recording_stops": recording.unfinished,
     }
-    return {key: _finite(value) for key, value in summary.items()}
-
-
-def _finite(value: Any) -> Any:
-    """The same with null for what is not finite: JSON has no other word for it."""
-    if isinstance(value, dict):
-        return {key: _finite(inner) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_finite(inner) for inner in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    return {key: finite(value) for key, value in summary.items()}
 
 
 def _traffic(recording: Recording) -> dict[str, Any]:
@@ -158,9 +152,18 @@ def _traffic(recording: Recording) -> dict[str, Any]:
             "command": recording.counter("command_messages"),
         },
         "intact_links": recording.intact_links(),
+        "replaced_links": _replaced_links(recording),
         "rejected_messages": recording.counter("rejected_messages"),
+        "rejected_by_reason": rejected_by_reason(recording),
+        "refused_peers": refused_peers(recording),
         "ticks_lost": recording.counter("ticks_lost"),
     }
+
+
+def _replaced_links(recording: Recording) -> int | None:
+    """Links with an end that was replaced: their ends have not counted the same messages."""
+    links = recording.links()
+    return None if links is None else sum(not link.whole for link in links)
 
 
 def _legs(recording: Recording, shape_error_m: Any) -> dict[str, Any]:
@@ -229,6 +232,7 @@ def _central(central: CentralComparison) -> dict[str, Any]:
         "node": worst.node,
         "quantity": worst.quantity,
         "ticks_compared": central.ticks,
+        "degraded_from_tick": central.degraded_from,
         "values_missing": central.missing,
         "by_quantity": central.per_quantity,
         "first_above_1e-12": first and {"tick": first.tick, "node": first.node},

@@ -16,10 +16,11 @@ from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 
 from analysis.mcap_records import read_bytes
 from analysis.mcap_walk import DATA_DOUBT, Damage, Piece, Walk
-from analysis.recording import check_version, needed_topics, not_ours
+from analysis.recorded_format import check_version, needed_topics, not_ours
 from wire.channels import METADATA
+from wire.config_json import loads
 from wire.errors import UsageError
-from wire.run_config import RunConfig, loads
+from wire.run_config import RunConfig
 
 LIBRARY = "octarm"
 """What the file's header says of the program that wrote it."""

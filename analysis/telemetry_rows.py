@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from analysis.recording import Recording
 from analysis.table import Table
-from wire.channels import ANNOUNCED, ARM_SO_FAR, LATE_AT, Channel, label
+from wire.channels import ANNOUNCED, ARM_SO_FAR, LATE_AT, Channel, before_version_5, label
 from wire.messages import PLANT
 from wire.telemetry import telemetry_layout
 
@@ -39,8 +39,9 @@ def telemetry_rows(recording: Recording) -> dict[int, Array]:
     """Each sender's rows (ticks, columns), in the order of `telemetry_channels`, from tick 0 to the last one
     that anybody has reached.
 
-    NaN where there is nothing: in a late tick of a node, where telemetry was lost, and past the end of a
-    sender. UsageError if a channel has not the fields that it should have.
+    NaN where there is nothing: in a late tick of a node, while it was out, where telemetry was lost, and past
+    the end of a sender. Channels that recordings before version 5 lack say that all was well. UsageError if a
+    channel has not the fields that it should have.
     """
     layout = telemetry_channels(recording)
     ticks = 1 + max(
@@ -74,4 +75,9 @@ def _rows(recording: Recording, channels: Sequence[Channel], ticks: int) -> Arra
         recording.tables.get(channel.topic, _NOTHING).by_tick(channel.fields, ticks)
         for channel in channels
     ]
+    if recording.format_version < 5:
+        there = np.isfinite(np.concatenate(parts, axis=1)).any(axis=1)
+        for channel, part in zip(channels, parts, strict=True):
+            if channel.topic not in recording.tables and (said := before_version_5(channel)):
+                part[there] = said
     return np.concatenate(parts, axis=1)

@@ -12,6 +12,18 @@ from pathlib import Path
 from wire.errors import UsageError
 
 
+def make_directory(out: Path) -> None:
+    """Make a directory for files that come later, if it is missing; UsageError if it cannot be written."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise UsageError(
+            f"--out {out}: {error.strerror or error}; give a directory that can be written"
+        ) from None
+
+
 def check_free_directory(out: Path, ours: Callable[[Path], bool], *, force: bool) -> None:
     """Raise UsageError if `out` exists and may not be replaced.
 

@@ -18,6 +18,7 @@ from analysis.panels.courses import (
 from analysis.panels.errors import draw_estimation, draw_tip
 from analysis.panels.exchange import draw_messages, draw_sweep_course, draw_sweeps
 from analysis.panels.frame import Cell
+from analysis.panels.health import draw_health
 from analysis.panels.maps import (
     draw_commands,
     draw_curvature,
@@ -43,6 +44,7 @@ PANELS: dict[str, Callable[[Cell, Recording], None]] = {
     "sweeps": draw_sweeps,
     "sweep-course": draw_sweep_course,
     "messages": draw_messages,
+    "health": draw_health,
 }
 """In the order in which a figure has them."""
 SUMMARY = ("shapes", "estimation", "tip", "commands", "deviation", "sweeps")

@@ -20,6 +20,7 @@ from matplotlib.transforms import ScaledTranslation, blended_transform_factory
 
 from analysis.goals import active_setpoints, colour
 from analysis.recording import Recording
+from wire.channels import Degraded
 from wire.foxglove import EVENTS
 
 Array = npt.NDArray[np.float64]
@@ -31,7 +32,7 @@ STRIP_PT = 4.0
 FEW = 60
 """With fewer values than this in a course each one is drawn as a point as well."""
 SHORT_S = 0.05
-BREAKS = ("interrupted", "safety_stop", "telemetry_lost")
+BREAKS = ("interrupted", "safety_stop", "telemetry_lost", "disk_full", "node_gone", "passive")
 """Events that a line marks; the changes of gains and the late ticks have marks of their own."""
 
 
@@ -116,6 +117,20 @@ def over_time(ax: Any, recording: Recording, *, top: bool = True, bottom: bool =
                 zorder=5,
                 label="_late",
             )
+        bridged = recording.times_s[bridged_ticks(recording)]
+        if bridged.size:
+            ax.plot(
+                bridged,
+                np.zeros(bridged.size),
+                "|",
+                transform=across,
+                color=VERMILION,
+                markersize=9,
+                markeredgewidth=0.8,
+                clip_on=False,
+                zorder=5.1,
+                label="_bridged",
+            )
     for times in breaks(recording).values():
         for at in times:
             # What ended the run may have come after the last tick that all have told of.
@@ -155,6 +170,15 @@ def key_of_marks(recording: Recording) -> list[Any]:
         handles.append(
             Line2D([], [], color="black", linewidth=0, marker="|", markersize=9, label=text)
         )
+    bridged = int(np.count_nonzero(bridged_ticks(recording)))
+    if bridged:
+        text = f"sums bridged ({ticks_in_words(bridged)})"
+        handles.append(
+            Line2D([], [], color=VERMILION, linewidth=0, marker="|", markersize=9, label=text)
+        )
+    out = int(np.count_nonzero(recording.out.any(axis=1)))
+    if out:
+        handles.append(Patch(color=MISSING, label=f"a node out ({ticks_in_words(out)})"))
     missing = missing_ticks(recording)
     if missing:
         text = f"not recorded ({ticks_in_words(missing)})"
@@ -171,10 +195,18 @@ def ticks_in_words(ticks: int) -> str:
     return "1 tick" if ticks == 1 else f"{ticks} ticks"
 
 
+def bridged_ticks(recording: Recording) -> npt.NDArray[np.bool_]:
+    """(K,) ticks in which a node bridged a sum that did not come."""
+    bridged = int(Degraded.FORWARD_BRIDGED | Degraded.BACKWARD_BRIDGED)
+    return np.asarray(((recording.flags & bridged) != 0).any(axis=1))
+
+
 def missing_ticks(recording: Recording) -> int:
-    """Ticks of which the recorder lacks what a node or the plant should have told; late ones tell less."""
+    """Ticks of which the recorder lacks what a node or the plant should have told; late ones tell less, and a
+    node that is out nothing."""
     lacks = ~np.isfinite(recording.truth).all(axis=(1, 2))
-    lacks |= ~np.isfinite(recording.estimates).all(axis=(1, 2)) & ~recording.late
+    told = np.isfinite(recording.estimates).all(axis=2) | recording.out
+    lacks |= ~told.all(axis=1) & ~recording.late
     return int(np.count_nonzero(lacks))
 
 

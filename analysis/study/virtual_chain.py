@@ -183,11 +183,11 @@ class VirtualNode:
     # -- the outlet ---------------------------------------------------------------------------------
 
     def send_forward(self, tick: int, setpoint: int) -> None:  # noqa: ARG002
-        """See `node.block.Outlet`."""
+        """See `node.outlet.Outlet`."""
         self._sent.append((What.FORWARD, self.forward.copy()))
 
     def send_backward(self, tick: int, setpoint: int) -> None:  # noqa: ARG002
-        """See `node.block.Outlet`."""
+        """See `node.outlet.Outlet`."""
         self._sent.append((What.BACKWARD, self.backward.copy()))
 
     def send_commands(self, tick: int, setpoint: int) -> None:

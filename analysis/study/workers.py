@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from typing import Any, TypeVar
 
+from analysis.one_thread import one_thread_in_children
+
 Result = TypeVar("Result")
-_THREADS = "OPENBLAS_NUM_THREADS"
 
 
 def call_all(
@@ -38,7 +38,7 @@ def call_all(
     context = multiprocessing.get_context("spawn")
     calls = 1 if fresh else None
     with (
-        _one_thread(),
+        one_thread_in_children(),
         ProcessPoolExecutor(max(1, jobs), context, max_tasks_per_child=calls) as pool,
     ):
         futures = [pool.submit(function, *one) for one in arguments]
@@ -51,17 +51,3 @@ def call_all(
             pool.shutdown(wait=False, cancel_futures=True)
             raise
         return [future.result() for future in futures]
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Linear algebra of the processes started meanwhile keeps to one processor each."""
-    before = os.environ.get(_THREADS)
-    os.environ[_THREADS] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[_THREADS]
-        else:
-            os.environ[_THREADS] = before

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +21,7 @@ from closed_form import artefact
 
 from deploy import Deployment, SegmentGrid, deploy
 from deploy.node_configs import node_configs
-from deploy.path import make_references
+from deploy.path import References, make_references
 from node.scheduling import Sectors
 from node.sweep import NodeSweep
 from plant.disturbance import DisturbanceSpec
@@ -30,23 +31,26 @@ from plant.noise import SensorNoise
 from recorder.writer import RecordingWriter
 from wire.artefact import GainsArtefact, write_artefact
 from wire.channels import (
+    DEGRADED,
     FORMAT_VERSION,
     NODES_ATTACHMENT,
     SHAPE_POINTS,
+    WELL,
     label,
     node_channels,
     plant_channels,
 )
+from wire.config_json import dumps
 from wire.messages import PLANT
 from wire.run_config import (
     DisturbanceConfig,
     LegConfig,
     LinkConfig,
+    NodeConfig,
     NoiseConfig,
     PaceConfig,
     RunConfig,
     SchedulingConfig,
-    dumps,
 )
 
 Array = npt.NDArray[np.float64]
@@ -80,6 +84,7 @@ class Scenario:
     bump_s: float = 2.0
     late: frozenset[int] = frozenset()
     """Ticks that have no sweep; with any, the run is one in real time."""
+    realtime: bool = False
 
 
 def scheduling(artefact: GainsArtefact, scenario: Scenario) -> SchedulingConfig:
@@ -131,22 +136,63 @@ def run_config(
         ),
         energy_weights=tuple(tuple(row) for row in deployment.energy_weights.tolist()),
         segments_per_process=1,
-        pace=PaceConfig(scenario.tick_s, 3) if scenario.late else None,
+        pace=PaceConfig(scenario.tick_s, 30 if scenario.realtime else 3)
+        if scenario.late or scenario.realtime
+        else None,
     )
 
 
-def write_recording(
-    path: Path,
-    scenario: Scenario = Scenario(),
-    artefact: GainsArtefact | None = None,
-    *,
-    close: bool = True,
-    skip: frozenset[tuple[int, int]] = frozenset(),
-) -> RunConfig:
-    """Simulate and record; `skip` holds the (tick, sender) whose rows are lost; `close`
-    is False for a recorder that was killed after its last flush."""
-    artefact = artefact or make_artefact()
-    attached = path.with_suffix(".gains.json")
+@dataclass(frozen=True)
+class Stage:
+    """All that a simulation needs, and the file that it grows into."""
+
+    run: RunConfig
+    artefact: GainsArtefact
+    deployment: Deployment
+    references: References
+    configs: list[NodeConfig]
+    plant: ArmPlant
+    noise: SensorNoise
+    writer: RecordingWriter
+
+    def plant_row(
+        self,
+        tick: int,
+        *,
+        late: bool = False,
+        sweep_ns: float = 0.0,
+        health: Sequence[float] | None = None,
+        passive: bool = False,
+        command: Array | None = None,
+    ) -> list[float]:
+        """The plant's row of a tick, before the arm moves in it."""
+        run, plant = self.run, self.plant
+        tip, truth = plant.tip(), plant.truth()
+        mean = np.diff(run.faces_m) @ (truth - self.references.states(tick)[:, :4])
+        wanted = self.references.plant.at(tick)[:2]
+        shape_at = np.linspace(0.0, self.artefact.arm.length_m, SHAPE_POINTS)
+        return [
+            *truth.ravel().tolist(),
+            *tip.tolist(),
+            float(np.hypot(*(tip - wanted))),
+            *wanted.tolist(),
+            *plant.energy(),
+            float(mean[1]),
+            float(mean[3]),
+            *plant.shape_at(shape_at).ravel().tolist(),
+            *([float(WELL)] * run.nodes if health is None else health),
+            float(passive),
+            0.0 if command is None else plant.load_potential(command),
+            float(late),
+            3.1e8 + 1e6 * tick,
+            3.1e8 + 1e6 * tick,
+            sweep_ns,
+            1e5,
+        ]
+
+
+def stage(growing: Path, attached: Path, scenario: Scenario, artefact: GainsArtefact) -> Stage:
+    """Everything before the first tick; the recording grows at `growing`."""
     sha256 = write_artefact(artefact, attached)
     deployment = deploy(artefact, scenario.nodes, scenario.tick_s, scenario.spacing)
     run = run_config(scenario, artefact, deployment, sha256)
@@ -176,7 +222,6 @@ def write_recording(
         run.first_hold_s,
         run.legs,
     )
-    growing = path.with_suffix(".growing")
     writer = RecordingWriter(growing, run.tick_s, layout, flush_s=math.inf)
     configs = node_configs(run, deployment, references, lambda _: LINKS)
     writer.head(
@@ -193,15 +238,32 @@ def write_recording(
             NODES_ATTACHMENT: f"[{','.join(map(dumps, configs))}]",
         },
     )
+    return Stage(run, artefact, deployment, references, list(configs), plant, noise, writer)
+
+
+def write_recording(
+    path: Path,
+    scenario: Scenario = Scenario(),
+    artefact: GainsArtefact | None = None,
+    *,
+    close: bool = True,
+    skip: frozenset[tuple[int, int]] = frozenset(),
+) -> RunConfig:
+    """Simulate and record; `skip` holds the (tick, sender) whose rows are lost; `close`
+    is False for a recorder that was killed after its last flush."""
+    growing = path.with_suffix(".growing")
+    made = stage(growing, path.with_suffix(".gains.json"), scenario, artefact or make_artefact())
+    run, plant, writer = made.run, made.plant, made.writer
+    n, index = run.nodes, run.setpoint_index
     sweeps = [
         NodeSweep(
             node,
             index,
-            reference=references.nodes[i],
+            reference=made.references.nodes[i],
             sectors=Sectors.of(run.scheduling),
             fade=math.exp(-run.tick_s / run.scheduling.bump_s),
         )
-        for i, node in enumerate(deployment.nodes)
+        for i, node in enumerate(made.deployment.nodes)
     ]
     wall = np.random.default_rng(run.seed)
     command = np.array([sweep.command for sweep in sweeps])
@@ -213,25 +275,11 @@ def write_recording(
                 for sweep in sweeps:
                     sweep.skip_to(k)
             command = np.array([sweep.command for sweep in sweeps])
-            rows = node_rows(sweeps, plant.measure() + noise.sample(k, n), wall)
-        tip, truth = plant.tip(), plant.truth()
-        mean = np.diff(run.faces_m) @ (truth - references.states(k)[:, :4])
-        wanted = references.plant.at(k)[:2]
-        rows[PLANT] = [
-            *truth.ravel().tolist(),
-            *tip.tolist(),
-            float(np.hypot(*(tip - wanted))),
-            *wanted.tolist(),
-            *plant.energy(),
-            float(mean[1]),
-            float(mean[3]),
-            *plant.shape_at(np.linspace(0.0, artefact.arm.length_m, SHAPE_POINTS)).ravel().tolist(),
-            float(late),
-            3.1e8 + 1e6 * k,
-            3.1e8 + 1e6 * k,
-            0.0 if k + 1 in scenario.late else float(np.round(1e6 * wall.lognormal(-0.8, 0.3))),
-            1e5,
-        ]
+            rows = node_rows(sweeps, plant.measure() + made.noise.sample(k, n), wall)
+        sweep_ns = (
+            0.0 if k + 1 in scenario.late else float(np.round(1e6 * wall.lognormal(-0.8, 0.3)))
+        )
+        rows[PLANT] = made.plant_row(k, late=late, sweep_ns=sweep_ns, command=command)
         writer.tick(k, {s: row for s, row in rows.items() if (k, s) not in skip})
         plant.advance(command, k)
     writer.event(run.ticks, "info", "finished", "every tick was done")
@@ -261,7 +309,7 @@ def node_rows(
     for i, sweep in enumerate(sweeps):
         instants = 2 + (i > 0) + (i < n - 1)
         row = sweep.row.now(sweep.reference)
-        row[-instants:] = wall.integers(0, 10**6, instants)
+        row[-instants - len(DEGRADED) : -len(DEGRADED)] = wall.integers(0, 10**6, instants)
         rows[i] = row.tolist()
         sweep.accept(sweep.output())
     return rows

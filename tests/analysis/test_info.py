@@ -12,7 +12,9 @@ from typing import Any
 import in_process
 import numpy as np
 import pytest
+from altered import alter
 from container import Anatomy, check_container
+from degraded_run import Faults, write_degraded
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
@@ -20,7 +22,9 @@ from simulated_run import Scenario, write_recording
 
 from analysis.info import channel_groups, info
 from analysis.info_table import MOST_EVENTS, info_table
+from analysis.recording import read_recording
 from analysis.recover import recover
+from wire.channels import Health
 from wire.errors import UsageError
 
 DATA = Path(__file__).parents[1] / "data"
@@ -113,9 +117,37 @@ def test_bytes_by_kind_of_record_add_up_to_the_file(path: Path, facts: dict[str,
     assert size["bytes_per_tick"]["file"] == pytest.approx(len(raw) / 60)
 
 
+def test_a_bridged_sum_has_no_latency_and_health_is_counted(tmp_path: Path) -> None:
+    path, other = tmp_path / "recording.mcap", tmp_path / "other.mcap"
+    faults = Faults(cut=frozenset({(30, 2, "forward")}), dies=((0, 10, 14),), passive_from=35)
+    write_degraded(path, Scenario(nodes=4, ticks=40), faults)
+    for tick, longest_ms in ((30, 0.0), (25, 1e3)):  # the sum of tick 25 did come
+        field = "forward_received_wall_ns"
+        topic = "/node/02/timing"
+        alter(path, other, topic=topic, tick=tick, field=field, change=lambda _: 1e9 + 7.0)
+        links = {(x["from"], x["to"]): x["latency_ms"] for x in info(other)["links"]["links"]}
+        assert links[1, 2]["max"] == pytest.approx(longest_ms)
+    recording = read_recording(path)
+    swept = ~recording.late
+    assert info(path)["health"] == {
+        "node_ticks": 35 * 4,
+        "alive": int((recording.health_says(Health.ALIVE)[swept]).sum()),
+        "on_time": int((recording.health_says(Health.ON_TIME)[swept]).sum()),
+        "valid": 35 * 4,
+        "bridged_sums": int(
+            np.count_nonzero(recording.flags & 1) + np.count_nonzero(recording.flags & 2)
+        ),
+        "commands_held": int(np.count_nonzero(recording.flags & 4)),
+        "replaced": {"0": 1},
+        "passive_from_tick": 35,
+        "passive_ticks": 5,
+    }
+    assert info(path)["health"]["alive"] == 35 * 4 - 4
+
+
 def test_run_duration_losses_and_events(facts: dict[str, Any]) -> None:
     assert facts["whole"] is True
-    assert facts["format_version"] == "4"
+    assert facts["format_version"] == "5"
     duration = facts["duration"]
     assert (duration["ticks"], duration["ticks_asked_for"]) == (60, 60)
     assert duration["arm_s"] == pytest.approx(6.0)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from simulated_run import Scenario, write_recording
 
-from analysis.link_times import link_facts, percentiles_ms
+from analysis.link_times import link_facts, own_clocks, percentiles_ms
 from analysis.recording import Recording, read_recording
 from wire.link_latency import (
     CLOCKS,
@@ -129,3 +129,8 @@ def test_lost_ticks_do_not_shift_the_others(tmp_path: Path) -> None:
     hop = c.numbers("forward_received_wall_ns") - y.numbers("measurement_received_wall_ns")
     (row,) = [row for row in facts["links"] if (row["way"], row["from"]) == ("forward", 0)]
     assert row["latency_ms"]["p50"] == pytest.approx(1e-6 * np.median(hop), rel=1e-12)
+
+
+def test_hosts_of_more_nodes_than_there_are_cost_no_memory() -> None:
+    hosts = json.dumps([{"nodes": 1, "own_clock": False}, {"nodes": 10**400, "own_clock": True}])
+    assert own_clocks(hosts, 3, []) == {1, 2}

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import socket
 from collections.abc import Iterator
+from pathlib import Path
 from random import Random
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from degraded_run import Faults, write_degraded
 from live_frames import Array, check_frame, latency, live_config, telemetry
 from simulated_run import Scenario, write_recording
 
 from analysis.recording import Recording, read_recording
 from live.frame import STUCK_S, FrameMaker, lagrange
 from live.process import LiveProcess
+from wire.channels import WELL, Health
 from wire.child import Child
 from wire.errors import OctarmError
-from wire.messages import PLANT, Batch
+from wire.messages import PLANT, Batch, encode_batch
 from wire.run_config import LegConfig
 
 BATCH = 12
@@ -160,23 +164,66 @@ def test_links_within_a_process_or_to_another_clock_are_left_out(
 def test_a_node_that_is_alone_in_being_late_is_named(
     recording: Recording, rows: dict[int, dict[int, Array]], clock: SimpleNamespace
 ) -> None:
-    maker = FrameMaker(live_config(recording, elsewhere=(4,)))
-    period_ns = 1e9 * recording.tick_s
-    due = rows[PLANT][30][maker._due]
+    """As the plant has seen it: each of the three things by itself, and only as long as it is so."""
+    maker = FrameMaker(live_config(recording))
+    at = maker._health_at.start
+    wrong = {
+        (30, 2): WELL & ~Health.ON_TIME,
+        (31, 1): WELL & ~Health.VALID,
+        (32, 3): WELL & ~(Health.ALIVE | Health.ON_TIME),
+    }
     for batch in all_batches(rows):
         changed = batch.rows.copy()
-        if batch.sender in (2, 4) and batch.tick <= 30 < batch.tick + len(changed):
-            changed[30 - batch.tick, -1] = due + period_ns + 1.0  # its command, just too late
+        for (tick, node), health in wrong.items():
+            if batch.sender == PLANT and batch.tick <= tick < batch.tick + len(changed):
+                changed[tick - batch.tick, at + node] = health
         maker.add(Batch(batch.tick, batch.sender, changed))
     frame = maker.frame(None, running=True)
     assert frame is not None
-    assert frame["nodes"]["late"] == [0, 0, 1, 0, 0]  # the clock of node 4 is another
-    assert frame["nodes"]["valid"] == [True, True, False, True, True]
+    assert frame["nodes"]["late"] == [0, 0, 1, 1, 0]
+    assert frame["nodes"]["alive"] == [True, True, True, False, True]
+    assert frame["nodes"]["on_time"] == [True, True, False, False, True]
+    assert frame["nodes"]["valid"] == [True, False, True, True, True]
     clock.s += 6.0
     frame = maker.frame(None, running=True)
     assert frame is not None
-    assert frame["nodes"]["valid"] == [True] * 5
-    assert frame["nodes"]["late"] == [0, 0, 1, 0, 0]
+    assert frame["nodes"]["alive"] == frame["nodes"]["valid"] == [True] * 5
+    assert frame["nodes"]["on_time"] == [False] * 5  # of the plant nothing has come for six seconds
+    assert frame["nodes"]["late"] == [0, 0, 1, 1, 0]
+
+
+def test_a_passive_arm_is_shown_at_once_and_bridged_sums_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "recording.mcap"
+    cut = frozenset((k, 2, "forward") for k in range(40, 60))
+    write_degraded(
+        path, Scenario(nodes=4, ticks=70), Faults(cut=cut, dies=((3, 20, 24),), passive_from=60)
+    )
+    recording = read_recording(path)
+    rows = telemetry(recording)
+    maker = FrameMaker(live_config(recording))
+    until(maker, rows, dict.fromkeys(range(4), 60) | {PLANT: 60})
+    frame = maker.frame(None, running=True)
+    assert frame is not None
+    assert (frame["tick"], frame["passive"]) == (59, False)
+    assert frame["nodes"]["flags"] == [0, 0, 1, 8]
+    bridged = np.count_nonzero(recording.flags & 3, axis=0).tolist()
+    assert bridged[2] >= 20
+    assert frame["nodes"]["bridged"] == bridged
+    assert frame["nodes"]["alive"] == [
+        True,
+        True,
+        True,
+        False,
+    ]  # for some ticks since the last frame
+    assert frame["nodes"]["late"][3] >= 4
+    few = [k for k in range(60) if not recording.flags[k].any() and recording.out[k].sum() == 0]
+    assert frame["links"]["ticks"] == len(few)
+    until(maker, rows, {PLANT: 62})
+    frame = maker.frame(None, running=False)
+    assert frame is not None
+    assert (frame["tick"], frame["passive"], frame["estimate_tick"]) == (61, True, 59)
+    assert frame["nodes"]["alive"] == [True] * 4  # it came back
+    assert maker.frame(None, running=False) is None  # nothing new
 
 
 def test_refused_telemetry_is_counted_for_its_sender(
@@ -309,3 +356,31 @@ def test_numbers_of_a_frame_are_plain(
             assert value is None or np.isfinite(value)
 
     walk(frame)
+
+
+class Finishing(Child):
+    """A launcher whose only word is that the run is over."""
+
+    def wait(self, seconds: float | None) -> list[dict[str, Any]]:
+        return [{"do": "finish", "state": "finished", "message": "", "dead": []}]
+
+
+def test_the_last_frame_is_of_the_last_tick_however_long_it_takes_to_read_all(
+    recording: Recording, rows: dict[int, dict[int, Array]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading is broken off to make frames in time, but not when the run is over."""
+    monkeypatch.setattr("live.process.DRAIN_S", -1.0)  # as if it got no core meanwhile
+    child = Finishing("live", control=-1, status=-1, directory=None)
+    process = LiveProcess(live_config(recording), child)
+    run = process._keys.run
+    raws = [encode_batch(run, b.tick, b.sender, b.rows) for b in all_batches(rows)]
+    samples = [SimpleNamespace(key_expr="", payload=raw) for raw in raws[-process._most :]]
+    process._samples = SimpleNamespace(try_recv=lambda: samples.pop(0) if samples else None)
+    assert process._news.enter()
+    process._hear(0.0)
+    shown = process._news.after(0)
+    assert shown is not None
+    frame, state = (json.loads(line[6:]) for line in shown[1].splitlines() if line[:5] == b"data:")
+    assert frame["tick"] == np.flatnonzero(~recording.late)[-1]
+    assert state["final"]
+    child.close()

@@ -44,6 +44,7 @@ def test_all_panels_go_into_one_png_beside_the_recording(
         "ticks": 30,
         "late_ticks": 1,
         "ticks_not_recorded": 0,
+        "ticks_bridged": 0,
         "width_in": 14.0,
         "height_in": facts["height_in"],
         "dpi": 50,

@@ -146,8 +146,8 @@ def rewrite(source: Path, target: Path, changes: dict[str, str | None]) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format_version": "99"}, "expected format version 3 or 4, got 99"),
-        ({"format_version": None}, "expected format version 3 or 4, got none"),
+        ({"format_version": "99"}, "expected format version 3, 4 or 5, got 99"),
+        ({"format_version": None}, "expected format version 3, 4 or 5, got none"),
         ({"run": None}, "no run configuration"),
         ({"run": "{"}, "run configuration: not JSON"),
         ({"run": '{"nodes": 3}'}, "run configuration: artefact_path is missing"),

@@ -485,7 +485,7 @@ def other_version(path: Path) -> None:
         (lambda path: path.write_bytes(MAGIC), "the run did not begin"),
         (lambda path: path.write_bytes(MAGIC + b"\x01\x00"), "the run did not begin"),
         (other_program, "not of octarm (its topics: /camera)"),
-        (other_version, "expected format version 3 or 4, got 99"),
+        (other_version, "expected format version 3, 4 or 5, got 99"),
         (lambda path: None, "No such file"),
     ],
 )

@@ -49,12 +49,13 @@ def checked(path: Path, span: Span = WHOLE) -> Comparison:
     return check(story_of(read_recording(path), span))
 
 
-def values_of(recording: Recording, ticks: int) -> int:
-    """How many values a full comparison has: of every node state, command, schedule and what it receives."""
+def values_of(recording: Recording, ticks: int, processes: int | None = None) -> int:
+    """How many values a full comparison has: of every node state, command, schedule, flags, and what it
+    receives, and of every forward sum to another process whether it is of the whole arm."""
     sums = sum(
         node.forward_received + node.backward_received for node in recording.deployment.nodes
     )
-    return ticks * (7 * recording.nodes + sums)
+    return ticks * (8 * recording.nodes + sums + (processes or recording.nodes) - 1)
 
 
 def test_what_nobody_changed_is_equal_and_nothing_is_left_out(finished: Path) -> None:
@@ -87,7 +88,7 @@ def test_segments_that_share_a_process_give_the_same_and_their_inner_sums_are_co
     assert len(story.nodes.configs) == -(-NODES // per_process)
     found = check(story)
     assert found.verdict is Verdict.EQUAL
-    assert found.values == values_of(recording, TICKS)
+    assert found.values == values_of(recording, TICKS, len(story.nodes.configs))
     assert found.node_ticks == NODES * TICKS
 
 

@@ -6,7 +6,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from analysis.solve_table import WIDTH, answer_table, suite_table
+from analysis.folded_table import WIDTH
+from analysis.solve_table import answer_table, suite_table
 from design.solve_suite import read_suite
 
 SUITE = Path(__file__).resolve().parents[2] / "examples" / "suite.toml"
