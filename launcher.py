@@ -5,15 +5,23 @@ What goes where, and the exit codes: supervise.entry, wire.errors.ExitCode.
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal, NoReturn
 
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    # Ctrl-C while all that follows is loaded is no traceback; supervise.entry takes over from there.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 import tyro
 
+from chaos.verbs import chaos
+from chapter.verbs import chapter
 from supervise.design_verbs import design, solve, study
 from supervise.entry import serve, show_json, teller
+from supervise.key_verbs import keys
 from supervise.options import RunOptions
 from supervise.recording_verbs import animate, diff, export, info, plot, recover, replay
 from supervise.shipped import DEFAULT_GAINS
@@ -39,6 +47,7 @@ def run(
     noise_velocity: float | None = RunOptions.noise_velocity,
     noise_curvature: float | None = RunOptions.noise_curvature,
     plant_cells: int | None = RunOptions.plant_cells,
+    plant_model: str | None = RunOptions.plant_model,
     spacing: str = RunOptions.spacing,
     out: Path | None = None,
     json: Flag = False,
@@ -53,10 +62,12 @@ def run(
     realtime: Flag = RunOptions.realtime,
     period: float | None = RunOptions.period_s,
     hold_ticks: int = RunOptions.hold_ticks,
+    restart: Flag = RunOptions.restart,
     segments_per_process: int = RunOptions.segments_per_process,
     sched: Literal["other", "fifo"] = "other",
     no_pin: Flag = False,
     hosts: Path | None = RunOptions.hosts,
+    keys: Path | None = RunOptions.keys,
     live: Flag = RunOptions.live,
     live_port: int | None = RunOptions.live_port,
 ) -> int:
@@ -79,6 +90,8 @@ def run(
         noise_velocity: Standard deviation of the velocity sensors in m/s.
         noise_curvature: Standard deviation of the curvature sensors in 1/m.
         plant_cells: Cells of the emulated arm's own grid; default max(40, 4 nodes) or the scenario's.
+        plant_model: What moves the emulated arm: exact (default), or for reproduction of the source chapter,
+            on its grid of 10 cells, quadratic (2) or linear (4), each also with -printed.
         spacing: Where the segments end: equispaced, chebyshev, or nodes + 1 boundaries in m from root to
             tip, separated by commas or in a file.
         out: Directory for recording, plot and log, made if missing; default runs/<run id>.
@@ -93,12 +106,16 @@ def run(
         by_hand: A node that you start yourself; may be given several times.
         realtime: Let the clock say when a tick begins, instead of as soon as the one before is done.
         period: Seconds between two ticks, wall clock, with --realtime; default: the tick.
-        hold_ticks: So many ticks in a row may be late, with --realtime, the last commands held; then the arm
-            goes safe and the run ends with exit code 4.
+        hold_ticks: So many ticks in a row may be late, with --realtime: for half of them the last commands
+            are held, then the nodes bridge what does not come; after that the arm goes passive and the run
+            ends with exit code 4.
+        restart: Replace a node that dies, or with --realtime stays stuck, while the others go on controlling.
         segments_per_process: Several segments in one process hand their sums on in memory.
         sched: Scheduling of plant and nodes: other (ordinary) or fifo (real-time, where it is permitted).
         no_pin: Leave the nodes' cores to the scheduler.
         hosts: Hosts file (TOML): which nodes run on which machine, over TCP; see docs/hosts.md.
+        keys: Directory made by `octarm keys`: processes meet over TCP with mutual TLS, and each says and hears
+            only what is its own; see docs/security.md.
         live: Show the running arm on a web page of this machine, best with --realtime; see docs/live.md.
         live_port: Port of that page on 127.0.0.1; default: a free one.
     """
@@ -118,6 +135,7 @@ def run(
         noise_velocity=noise_velocity,
         noise_curvature=noise_curvature,
         plant_cells=plant_cells,
+        plant_model=plant_model,
         spacing=spacing,
         out=out,
         transport=transport,
@@ -132,7 +150,9 @@ def run(
         realtime=realtime,
         period_s=period,
         hold_ticks=hold_ticks,
+        restart=restart,
         hosts=hosts,
+        keys=keys,
         live=live,
         live_port=live_port,
     )
@@ -292,7 +312,10 @@ VERBS: dict[str, Callable[..., int]] = {
     "recover": recover,
     "study": study,
     "bench": bench,
+    "keys": keys,
     "doctor": doctor,
+    "chaos": chaos,
+    "chapter": chapter,
 }
 
 

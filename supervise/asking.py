@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from analysis.solve_table import answer_table, suite_table
-from design.solve_command import Choices, finite, prepare
+from design.solve_command import Choices, prepare
 from design.solve_suite import read_suite
 from supervise import solving
 from supervise.shipped import SUITE
 from supervise.suite import run_suite
+from wire.config_json import finite
 from wire.errors import UsageError
 
 

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from supervise.hosts import Host
 from supervise.plan import Plan
-from wire.run_config import NodeConfig, dumps
+from wire.config_json import dumps
+from wire.run_config import NodeConfig
 
 
 def offer(plan: Plan, config: NodeConfig) -> str:
     """Write a node's configuration into the run's directory; returns the line that says how to start it."""
     host = plan.host_of(config.index)
     path = plan.directory / f"node-{config.index}.json"
+    path.touch(0o666 if config.links.tls is None else 0o600)  # who has it could be the node
     path.write_text(dumps(config) + "\n")
     where = "" if host.local else f" on {host.name}"
     command = host.hand_command(str(path) if host.local else path.name)

@@ -14,9 +14,12 @@ import select
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
+
+from supervise.status_line import LONGEST, status_of
+from wire.child import HELD_BACK
 
 PYTHON_ROOT = Path(__file__).resolve().parent.parent
 
@@ -42,6 +45,11 @@ class Handle:
     def alive(self) -> bool:
         """Whether the process still runs."""
         return not self.wait(0.0)
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the process was seen to end: not so if the pidfd was given back, or there never was one."""
+        return self._fd >= 0 and self.wait(0.0)
 
     def wait(self, seconds: float | None = None) -> bool:
         """Wait for the end, None: as long as it takes; whether it has come."""
@@ -89,9 +97,8 @@ class Process(Handle):
         environment = dict(os.environ)
         environment["OPENBLAS_NUM_THREADS"] = "1"
         environment["PYTHONUNBUFFERED"] = "1"
-        # SIGINT waits, blocked, until the child has its handler (wire.child): no half-loaded module
-        # is interrupted.
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        # They wait until the child has its handlers: no half-loaded module is interrupted.
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, HELD_BACK)
         try:
             self._popen = subprocess.Popen(
                 command,
@@ -110,10 +117,38 @@ class Process(Handle):
         self.control = self._popen.stdin
         self.status = self._popen.stdout.fileno()
         self._partial = b""
+        self._unsent = b""
+        self._queues = False
+        self._log = None if isinstance(errors, int) else errors
         os.set_blocking(self.status, False)
+
+    def queue(self) -> None:
+        """From now on nobody waits for a child that does not read: what its pipe has no room for is owed."""
+        self._queues = True
+        os.set_blocking(self.control.fileno(), False)
+
+    @property
+    def owed(self) -> bool:
+        """Whether something that the child was told waits for `push`."""
+        return bool(self._unsent) and not self.control.closed
+
+    def push(self) -> bool:
+        """Write what has room, without waiting; whether all of it went."""
+        try:
+            written = os.write(self.control.fileno(), self._unsent)
+            self._unsent = self._unsent[written:]
+        except BlockingIOError:
+            pass
+        except (BrokenPipeError, ValueError):  # its end is noticed elsewhere
+            self._unsent = b""
+        return not self._unsent
 
     def tell(self, line: str) -> None:
         """Write one line to the child; a child that is gone is noticed elsewhere."""
+        if self._queues:
+            self._unsent += line.encode() + b"\n"
+            self.push()
+            return
         try:
             self.control.write(line.encode() + b"\n")
             self.control.flush()
@@ -132,8 +167,29 @@ class Process(Handle):
             return []
         if not data:
             return None
+        return list(self._said(data))
+
+    def _said(self, data: bytes) -> Iterator[dict[str, Any]]:
+        """The status lines that are complete with these bytes; anything else that was written is logged."""
         *whole, self._partial = (self._partial + data).split(b"\n")
-        return [json.loads(line) for line in whole]
+        if len(self._partial) > LONGEST:  # and so is what never ends
+            whole.append(self._partial)
+            self._partial = b""
+        for line in whole:
+            status = self._status(line)
+            if status is None:
+                self._note(line)
+            else:
+                yield status
+
+    def _status(self, line: bytes) -> dict[str, Any] | None:
+        """The status in a line; None if it is none."""
+        return status_of(line)
+
+    def _note(self, line: bytes) -> None:
+        if self._log is not None:
+            self._log.write(f"{self.name}: ".encode() + line[:LONGEST] + b"\n")
+            self._log.flush()
 
     def adopt(self, name: str, pid: int, /) -> Handle | FarNode:
         """The handle of a process that this one has forked."""
@@ -170,5 +226,7 @@ def ending(code: int | None) -> str:
     if code is None:
         return "is gone"
     if code < 0:
-        return f"was ended by {signal.Signals(-code).name}"
+        with contextlib.suppress(ValueError):  # a real-time signal has no name
+            return f"was ended by {signal.Signals(-code).name}"
+        return f"was ended by signal {-code}"
     return f"exited with code {code}"

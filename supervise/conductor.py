@@ -1,31 +1,32 @@
 """Starts the processes of a run, waits for their links, watches them, and ends them whatever
 happens.
 
-One loop, one thread: pipes and pidfds of all children in a selector. It decides nothing about the
-arm; it only tells the plant to stop when a process fails, because only the plant can tell everybody
-at one tick.
+One loop, one thread: what the children say, and that they end, comes through `supervise.pipes`. It decides
+nothing about the arm; it only tells the plant to stop when a process fails, because only the plant can tell
+everybody at one tick.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
-import selectors
 import signal
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import monotonic
 from typing import Any, Self
 
 from supervise.by_hand import explain, offer
 from supervise.children import FarNode, Handle, Process, ending, module
+from supervise.ending import Ending
 from supervise.far import FarZygote
+from supervise.interrupts import Interrupts
+from supervise.pipes import Pipes
 from supervise.plan import Plan
+from supervise.replacing import Replacements
 from supervise.state import Outcome, RunState
 from supervise.view import View
 from wire.child import Deadline
-from wire.errors import ExitCode, OctarmError, StartUpTimeoutError
-from wire.run_config import dumps
+from wire.config_json import dumps
+from wire.errors import ExitCode, StartUpFailedError, StartUpTimeoutError, UsageError
 
 REPORT_S = 1.0
 """After the order to stop: for the nodes to say where they stood."""
@@ -33,14 +34,12 @@ RECORD_S = 30.0
 """For the recorder to write what is waiting, when everybody is well."""
 RECORD_FAULT_S = 2.0
 """The same when somebody is dead or frozen."""
+HURRY_S = 1.0
+"""So long the recorder has to close its file when the user asks for the end a second time."""
 RECORDER_SILENT_S = 5.0
 """A recorder that says nothing for so long, while it should be writing, is given up."""
-ZYGOTE_GRACE_S = 5.0
-"""The zygote needs more: it ends its own children first."""
-GRACE_S = 1.0
-"""Between SIGINT, SIGTERM and SIGKILL."""
-
-
+RECORDER_PATIENCE = 20
+"""Words of progress of the plant, ten a second at most, in which the recorder should have said one as well."""
 _ENDINGS = {
     ExitCode.OK: "finished",
     ExitCode.DEGRADED: "finished",
@@ -59,9 +58,14 @@ class Conductor:
     def __init__(self, plan: Plan, view: View) -> None:
         self._plan = plan
         self._view = view
-        self._selector = selectors.DefaultSelector()
+        self._pipes = Pipes(self._handle, self._gone)
         self._log_path = plan.directory / "processes.log"
-        self._log = self._log_path.open("ab")
+        try:
+            self._log = self._log_path.open("ab")
+        except OSError as error:
+            raise UsageError(
+                f"{self._log_path}: {error.strerror}; the run's directory must stay as long as it runs"
+            ) from None
         self._zygote: Process | None = None
         self._far: dict[str, FarZygote] = {}
         """By the names of their hosts."""
@@ -69,20 +73,18 @@ class Conductor:
         self._recorder: Process | None = None
         self._live: Process | None = None
         self._state = RunState(plan)
+        self._replacements = Replacements(plan)
+        self.begun = False
+        """The first tick was ordered: a node that dies is one of a moving arm, and there is a recording."""
         self._noted: set[str] = set()
-        self._interrupts = 0
+        self._interrupts = Interrupts()
         self._leaving = False
-        self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     # -- life -------------------------------------------------------------------------------------
 
     def __enter__(self) -> Self:
-        self._selector.register(self._wake_read, selectors.EVENT_READ, self._woken)
-        self._old_wakeup = signal.set_wakeup_fd(self._wake_write, warn_on_full_buffer=False)
-        self._old_handlers = {
-            number: signal.signal(number, self._on_signal)
-            for number in (signal.SIGINT, signal.SIGTERM)
-        }
+        self._pipes.watch(self._interrupts.wakes, self._interrupts.woken)
+        self._interrupts.begin()
         return self
 
     def __exit__(
@@ -98,25 +100,20 @@ class Conductor:
         try:
             self._end_all()
         finally:
-            signal.set_wakeup_fd(self._old_wakeup)
-            for number, handler in self._old_handlers.items():
-                signal.signal(number, handler)
+            self._interrupts.end()
             self._plan.endpoints.close()
-            self._selector.close()
+            self._pipes.close()
             self._log.close()
-            os.close(self._wake_read)
-            os.close(self._wake_write)
-            if self._log_path.exists() and self._log_path.stat().st_size == 0:
-                self._log_path.unlink()
+            self._interrupts.close()
+            if self._log_bytes() == 0:
+                self._log_path.unlink(missing_ok=True)
 
-    def _on_signal(self, *_: object) -> None:
-        self._interrupts += 1
-
-    def _woken(self) -> None:
+    def _log_bytes(self) -> int:
+        """How much the children had to say; nothing if somebody has removed the run's directory."""
         try:
-            os.read(self._wake_read, 4096)
-        except BlockingIOError:
-            return
+            return self._log_path.stat().st_size
+        except OSError:
+            return 0
 
     # -- the whole run ----------------------------------------------------------------------------
 
@@ -132,15 +129,20 @@ class Conductor:
         self._view.note(f"{nodes}, plant and recorder linked in {monotonic() - began:.2f} s")
         self._event(0, "info", "started", f"{self._plan.run.nodes} nodes linked")
         self._order(self._plant, do="start")
+        self.begun = True
         self._show("start")
         first = monotonic()
         self._watch()
         run_s = monotonic() - first
         self._collect_reports()
-        code, message, tick = self._state.verdict(interrupted=self._interrupts > 0)
+        code, message, tick = self._state.verdict(interrupted=self._interrupts.count > 0)
         self._show("ending", message=message)
         self._finish_recording(code, message, tick)
-        troubles = (self._state.recording_trouble(), self._state.pace_trouble())
+        troubles = (
+            self._replacements.trouble(),
+            self._state.recording_trouble(),
+            self._state.pace_trouble(),
+        )
         if code is ExitCode.OK and any(troubles):
             code, message = ExitCode.DEGRADED, "; ".join(filter(None, troubles))
         self._show(
@@ -156,12 +158,12 @@ class Conductor:
         for host in plan.hosts:
             if host.start:
                 self._far[host.name] = far = FarZygote(host, self._log)
-                self._follow(far)
-                self._selector.register(
-                    far.errors, selectors.EVENT_READ, lambda far=far: self._read_errors(far)
-                )
+                self._pipes.follow_far(far)
         if any(host.local for host in plan.hosts):
-            self._zygote = self._start("zygote", "node", "--zygote", "--parent", own)
+            private = plan.endpoints.private
+            where = () if private is None else ("--directory", private)
+            self._zygote = self._start("zygote", "node", "--zygote", "--parent", own, *where)
+        plan.endpoints.make()  # now that there is somebody to remove it if this process is killed
         self._plant = self._start("plant", "plant", own)
         self._recorder = self._start("recorder", "recorder", own)
         self._plant.tell(dumps(plan.plant))
@@ -182,23 +184,21 @@ class Conductor:
 
     def _start(self, name: str, room: str, *arguments: str) -> Process:
         process = Process(name, module(room, *arguments), self._log)
-        self._follow(process)
+        self._pipes.follow(process)
         return process
-
-    def _follow(self, process: Process) -> None:
-        self._selector.register(process.status, selectors.EVENT_READ, lambda: self._read(process))
-        self._selector.register(process, selectors.EVENT_READ, lambda: self._gone(process))
 
     def _wait_linked(self, limit: Deadline) -> None:
         state = self._state
         while not state.all_linked:
-            self._turn(min(limit.left, 1.0))
-            if self._interrupts:
+            self._pipes.turn(min(limit.left, 1.0))
+            if self._interrupts.count:
                 raise Interrupted
             if state.failures or state.ended:
-                self._turn(0.05)  # the others may know more
-                raise OctarmError(
-                    f"start-up failed: {state.why_not_started()}; see {self._log_path}"
+                self._pipes.turn(0.05)  # the others may know more
+                more = f"; see {self._log_path}" if self._log_bytes() else ""
+                raise StartUpFailedError(
+                    f"start-up failed: {state.why_not_started()}{more}",
+                    state.gave_up or ExitCode.START_UP_TIMEOUT,
                 )
             if limit.passed:
                 raise StartUpTimeoutError(
@@ -211,23 +211,31 @@ class Conductor:
         """Until the plant has stopped, or cannot any more."""
         state = self._state
         ordered: Deadline | None = None
+        by_user = False
         while state.plant_stop is None and "plant" not in state.ended:
-            if ordered is None:
+            if ordered is None or (
+                self._interrupts.count and not by_user
+            ):  # who need not see the arm rest
                 cause, reason = "safety", state.reason_to_stop()
-                if self._interrupts:
-                    cause, reason = "interrupted", "interrupted by the user"
+                if self._interrupts.count:
+                    cause, reason, by_user = "interrupted", "interrupted by the user", True
                 if reason is not None:
                     self._order(self._plant, do="stop", cause=cause, text=reason)
                     ordered = Deadline(REPORT_S)
-            self._turn(0.5 if ordered is None else min(0.5, ordered.left))
-            if ordered is not None and ordered.passed:
+            self._pipes.turn(0.5 if ordered is None else min(0.5, ordered.left))
+            if ordered is not None and ordered.passed and not state.passive_s_left:
                 return
 
     def _collect_reports(self) -> None:
-        """After the plant's order to stop: let the nodes say where they stood."""
+        """After the plant's order to stop: let the nodes say where they stood, the zygote how others ended."""
         limit = Deadline(REPORT_S if self._state.plant_stop is not None else 0.0)
-        while not limit.passed and self._state.unheard:
-            self._turn(min(0.2, limit.left))
+        while not limit.passed and (self._state.unheard or self._unexplained):
+            self._pipes.turn(min(0.2, limit.left))
+
+    @property
+    def _unexplained(self) -> list[int]:
+        alive = self._zygote is not None and self._zygote.alive
+        return self._state.unexplained if alive else []
 
     # -- the end ----------------------------------------------------------------------------------
 
@@ -238,93 +246,51 @@ class Conductor:
             ExitCode.INTERRUPTED: ("warning", "interrupted", message),
         }
         self._event(tick, *names.get(code, ("error", "safety_stop", message)))
-        seconds = RECORD_S if code in names else RECORD_FAULT_S
-        self._order(self._recorder, do="finish", seconds=seconds, dead=self._state.silent)
+        well = code in names and not (code is ExitCode.INTERRUPTED and self._state.unheard)
+        seconds = RECORD_S if well else RECORD_FAULT_S
+        about = {"dead": self._state.silent, "refused": self._state.refused_peers}
+        self._order(self._recorder, do="finish", seconds=seconds, **about)
         # It reports while it writes, however long that takes; without a word it is frozen.
         state = self._state
         state.recorder_spoke = monotonic()
+        hurry: Deadline | None = None
         while state.closed is None and "recorder" not in state.ended:
-            self._turn(0.2)
-            if self._interrupts > 1 or monotonic() - state.recorder_spoke > RECORDER_SILENT_S:
+            if (
+                self._interrupts.count > 1 and hurry is None
+            ):  # the file is closed, but waits for nobody
+                hurry = Deadline(HURRY_S)
+                self._order(self._recorder, do="finish", seconds=0.0, **about)
+            self._pipes.turn(0.2)
+            hurried = hurry is not None and (hurry.passed or self._interrupts.count > 2)
+            if hurried or monotonic() - state.recorder_spoke > RECORDER_SILENT_S:
                 return
 
     def _end_all(self) -> None:
         """SIGINT, SIGTERM, SIGKILL, each with a grace, to what this run started and still lives."""
         self._order(self._plant, do="end")
-        for far in self._far.values():  # no signal reaches their nodes; they end meanwhile
-            self._let_go(far)
+        far = list(self._far.values())
+        for host in far:  # no signal reaches their nodes; they end meanwhile
+            self._pipes.let_go(host)
         own = [h for h in self._state.nodes.values() if isinstance(h, Handle)]
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-            self._end(number, [*own, self._plant, self._recorder, self._live])
+        direct = [one for one in (self._plant, self._recorder, self._live) if one is not None]
+        end = Ending(self._pipes.turn, lambda: self._interrupts.count > 1)
+        end.processes([*own, *direct])
+        # Before the zygotes are waited for: nobody is left who would remove them if the launcher died now.
+        self._plan.endpoints.close()
         # Last the zygotes, which end whatever they have forked in the meantime.
-        if self._zygote is not None:
-            self._zygote.control.close()
-        self._await_end([far for far in self._far.values() if far.up], ZYGOTE_GRACE_S)
-        self._end(signal.SIGTERM, [self._zygote, *self._far.values()], ZYGOTE_GRACE_S)
-        self._end(signal.SIGKILL, [self._zygote, *self._far.values(), *own])
-        direct = (self._zygote, *self._far.values(), self._plant, self._recorder, self._live)
-        for process in direct:
+        end.zygotes(self._zygote, far, own)
+        for process in (self._zygote, *far, *direct):
             if process is not None:
-                self._forget(process)
+                self._pipes.forget(process)
                 process.reap()
                 process.close()
         for handle in self._state.nodes.values():
             handle.close()
 
-    def _end(
-        self,
-        number: signal.Signals,
-        handles: Sequence[Handle | None],
-        grace_s: float = GRACE_S,
-    ) -> None:
-        """Send a signal to those that live, and give them time."""
-        self._turn(0.0)
-        living = [handle for handle in handles if handle is not None and handle.alive]
-        for handle in living:
-            handle.signal(number)
-        self._await_end(living, grace_s)
-
-    def _await_end(self, handles: Sequence[Handle], grace_s: float) -> None:
-        limit = Deadline(grace_s if self._interrupts < 2 else 0.2)
-        while not limit.passed and any(handle.alive for handle in handles):
-            self._turn(min(0.05, limit.left))
-
     # -- events -----------------------------------------------------------------------------------
 
-    def _turn(self, seconds: float) -> None:
-        """Wait for something to happen and handle it."""
-        for key, _ in self._selector.select(seconds):
-            act: Callable[[], None] = key.data
-            act()
-        for far in self._far.values():
-            far.beat()
-
-    def _forget(self, process: Process) -> None:
-        for item in (process, process.status, getattr(process, "errors", -1)):
-            with contextlib.suppress(KeyError, ValueError):
-                self._selector.unregister(item)
-
-    def _let_go(self, far: FarZygote) -> None:
-        with contextlib.suppress(KeyError, ValueError):
-            self._selector.unregister(far.control)
-        far.let_go()
-
-    def _push(self, far: FarZygote) -> None:
-        if far.push():
-            self._selector.unregister(far.control)
-
-    def _read_errors(self, far: FarZygote) -> None:
-        if not far.read_errors():
-            self._selector.unregister(far.errors)
-
-    def _gone(self, process: Process) -> None:
-        """A direct child has ended: read its last words, remember how if nobody asked it to."""
-        self._read(process)
-        code = process.reap()
-        try:
-            self._selector.unregister(process)
-        except KeyError:
-            return
+    def _gone(self, process: Process, code: int | None) -> None:
+        """A direct child has ended: remember how if nobody asked it to."""
         how = ending(code)
         if isinstance(process, FarZygote):
             process.read_errors()
@@ -334,30 +300,22 @@ class Conductor:
         expected = self._leaving or (process is self._recorder and self._state.closed is not None)
         if not expected:
             self._state.ended[process.name] = how
-            if process is self._recorder and self._state.all_linked:
+            unsaid = process is self._recorder and not self._state.unrecorded
+            if unsaid and self._state.all_linked:
                 self._view.note(f"the recorder {ending(code)}: the run goes on unrecorded")
             if process is self._live and self._state.all_linked:
                 self._view.note(f"the live page {ending(code)}: the run goes on unseen")
 
-    def _read(self, process: Process) -> None:
-        lines = process.lines()
-        if lines is None:
-            with contextlib.suppress(KeyError):
-                self._selector.unregister(process.status)
-            return
-        for line in lines:
-            self._handle(process, line)
-
     def _handle(self, process: Process, line: dict[str, Any]) -> None:
         state = self._state
+        if line["event"] == "refused" and (line["from"], line["what"]) not in state.refused:
+            text = f"{line['from']} refused {line['what']}"
+            self._view.note(text)
+            self._event(state.ticks, "warning", "refused_peer", text)
         state.hear(line)
         match line["event"]:
             case "up" if isinstance(process, FarZygote) and line["from"] == process.name:
                 process.up = True
-                if not self._leaving:  # not before somebody reads there
-                    self._selector.register(
-                        process.control, selectors.EVENT_WRITE, lambda: self._push(process)
-                    )
             case "born":
                 node = line["node"]
                 state.nodes[node] = process.adopt(f"node {node}", line["pid"])
@@ -365,12 +323,29 @@ class Conductor:
                 node = line["node"]
                 if isinstance(far := state.nodes[node], FarNode):
                     far.close()
-                if not self._leaving:
-                    state.ended[f"node {node}"] = ending(line["code"])
+                self._died(node, ending(line["code"]))
+            case "out":
+                self._replacements.out(line["node"])
+                text = f"node {line['node']} is left out: it is {line['why']}"
+                self._event(line["tick"], "error", "node_gone", f"tick {line['tick']}: {text}")
+                handle = state.nodes.get(line["node"])
+                if line["why"] == "stuck" and isinstance(handle, Handle):
+                    handle.signal(signal.SIGKILL)  # it is replaced as one that has died
+            case "back":
+                self._is_back(line["node"], line["tick"])
+            case "passive":
+                self._event(line["tick"], "error", "passive", line["text"])
             case "listening":
                 self._view.say(f"live at {line['url']}")
             case "progress" if line["from"] == "plant":
                 self._view.progress(line["tick"])
+                silent = state.unheard_progress == RECORDER_PATIENCE
+                if silent and "recorder" not in state.ended:
+                    self._view.note(
+                        "the recorder does not answer: records may be lost, the run goes on"
+                    )
+            case "failed" if line["from"] == "recorder" and state.unrecorded:
+                self._view.note(f"{state.unrecorded}: the run goes on unrecorded")
             case "progress":
                 self._view.errors(line["tip_error_m"], line["estimation_error"])
             case "stopped" if line["from"] == "plant":
@@ -378,6 +353,30 @@ class Conductor:
             case "note" if line["text"] not in self._noted:  # n nodes have it to say
                 self._noted.add(line["text"])
                 self._view.note(f"{line['from']}: {line['text']}")
+
+    def _died(self, node: int, how: str) -> None:
+        """A node's process has ended: replace it, or remember how it ended if nobody asked it to."""
+        running = self.begun and not self._leaving and self._state.plant_stop is None
+        if running and self._replacements.replaceable(node):
+            self._state.nodes[node].close()
+            self._order(self._plant, do="gone", node=node)
+            self._view.note(f"node {node} {how}: it is replaced, the others go on")
+            host = self._plan.host_of(node)
+            zygote = self._far.get(host.name, self._zygote)
+            if zygote is not None:
+                zygote.tell(dumps(self._replacements.replacement(node)))
+        elif not self._leaving:
+            self._state.ended[f"node {node}"] = how
+            self._order(
+                self._plant, do="gone", node=node
+            )  # its token may vanish later than this is known
+
+    def _is_back(self, node: int, tick: int) -> None:
+        away_s = self._replacements.back(node)
+        after = "" if away_s is None else f" after {away_s:.2f} s"
+        text = f"node {node} works again from tick {tick} on{after}"
+        self._view.note(text)
+        self._event(tick, "info", "node_back", text)
 
     def _order(self, process: Process | None, **message: Any) -> None:
         if process is not None and process.alive:

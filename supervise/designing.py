@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
+from analysis.one_thread import one_thread
 from design.arm_file import ArmFile, read_arm_file
 from design.command import Job, assemble, check_options, jobs, longest_first
 from design.gain import GainDesign, Options, design_gain
@@ -104,7 +105,8 @@ def run_design(
         gains = {job: gains[job] for job in wanted}
         if request.only:
             return Designed(gains, None, None, parts.directory)
-        artefact = assemble(file, gains)
+        with one_thread():
+            artefact = assemble(file, gains)
         _check_output(request)  # minutes have passed
         try:
             sha = write_artefact(artefact, request.out)
@@ -257,9 +259,7 @@ class _Pool:
     def _start(self, job: Job) -> None:
         self._progress(f"{job}: started")
         arguments = (self._file, job.index, job.role, self._options, self._work)
-        name = f"octarm-{job.role}"
-        # matrices this small take longer on several threads, and their rounding depends on the number
-        engine = Engine(_design, arguments, name=name, one_thread=True)
+        engine = Engine(_design, arguments, name=f"octarm-{job.role}")
         self._running[engine.pipe] = _Worker(job, engine, time.monotonic() + self._limit_s)
 
     def _hear(self, worker: _Worker) -> None:

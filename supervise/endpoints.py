@@ -12,11 +12,12 @@ import errno
 import fcntl
 import os
 import random
+import secrets
 import shutil
 import socket
 import tempfile
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from supervise.hosts import LOWEST_PORT, Host, Hosts
@@ -43,13 +44,34 @@ class Endpoints:
     """Of nodes 0 .. n - 2; the tip node has no right neighbour to listen for."""
     private: str | None = None
     """Directory made for this run alone."""
+    _made: bool = False
+    """Whether it is there."""
     _lock: int = -1
     _created: Path | None = field(default=None)
+
+    def make(self) -> None:
+        """Make the private directory, if that was left for later; UsageError if it cannot be made."""
+        if self.private is None or self._made:
+            return
+        directory = Path(self.private)
+        try:
+            directory.mkdir(mode=0o700)
+            lock = _lock(directory)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise UsageError(
+                f"{directory} for the run's sockets: {reason}; set TMPDIR to a directory that can be written"
+            ) from None
+        self._made, self._lock = True, -1 if lock is None else lock
 
     def close(self) -> None:
         """Remove every socket, and the directory if this run made it."""
         remove_sockets([self.plant, *self.nodes])
-        if self.private is not None:
+        if self.private is not None and self._made:
+            with contextlib.suppress(
+                OSError
+            ):  # needs no descriptor, of which there may be none left
+                os.rmdir(self.private)
             shutil.rmtree(self.private, ignore_errors=True)
         elif self._created is not None:
             with contextlib.suppress(OSError):  # somebody else put something there
@@ -59,17 +81,35 @@ class Endpoints:
             self._lock = -1
 
 
-def choose(nodes: int, transport: str, base_port: int | None, socket_dir: Path | None) -> Endpoints:
-    """Choose and check the endpoints of a run; UsageError names what is taken or unusable."""
-    if transport == "tcp":
+def choose(
+    nodes: int,
+    transport: str,
+    base_port: int | None,
+    socket_dir: Path | None,
+    *,
+    tls: bool = False,
+    later: bool = False,
+) -> Endpoints:
+    """Choose and check the endpoints of a run; UsageError names what is taken or unusable.
+
+    `tls`: over TCP, with TLS on it, whatever `transport` says. `later`: a private directory is only named, and
+    made by `Endpoints.make`: when there is a process that outlives this one and removes it.
+    """
+    if tls or transport == "tcp":
         if socket_dir is not None:
             raise UsageError("--socket-dir is for --transport unix; leave it out with tcp")
-        return _tcp(nodes, base_port)
+        endpoints = _tcp(nodes, base_port)
+        return _with_tls(endpoints) if tls else endpoints
     if transport != "unix":
         raise UsageError(f"transport {transport!r}: expected 'unix' or 'tcp'")
     if base_port is not None:
         raise UsageError("--base-port is for --transport tcp; add it or leave the port out")
-    return _own_directory(nodes) if socket_dir is None else _given_directory(nodes, socket_dir)
+    if socket_dir is not None:
+        return _given_directory(nodes, socket_dir)
+    endpoints = _own_directory(nodes)
+    if not later:
+        endpoints.make()
+    return endpoints
 
 
 # -- unix sockets -------------------------------------------------------------------------------
@@ -92,10 +132,9 @@ def _own_directory(nodes: int) -> Endpoints:
     if too_long or any(character in str(base) for character in SPECIAL):
         base = Path("/tmp")
     _sweep(base)
-    directory = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base))  # mode 0700
-    lock = _lock(directory)
+    directory = base / (PREFIX + secrets.token_hex(4))
     plant, own = _in_directory(directory, nodes)
-    return Endpoints(plant, own, private=str(directory), _lock=-1 if lock is None else lock)
+    return Endpoints(plant, own, private=str(directory))
 
 
 def _lock(directory: Path) -> int | None:
@@ -117,11 +156,17 @@ def _sweep(base: Path) -> None:
             facts = directory.lstat()
             if facts.st_uid != os.getuid() or time.time() - facts.st_mtime < STALE_AFTER_S:
                 continue
+            if any(not _is_ours(entry) for entry in directory.iterdir()):
+                continue  # somebody's own, which only has a name like it
             if (handle := _lock(directory)) is not None:
                 shutil.rmtree(directory, ignore_errors=True)
                 os.close(handle)
         except OSError:
             continue
+
+
+def _is_ours(entry: Path) -> bool:
+    return entry.is_socket() or entry.name.endswith(".lock")
 
 
 def _given_directory(nodes: int, directory: Path) -> Endpoints:
@@ -228,6 +273,12 @@ def _ports(base: int, nodes: int) -> Endpoints:
     )
 
 
+def _with_tls(endpoints: Endpoints) -> Endpoints:
+    """The same ports, spoken to in TLS."""
+    plant, *nodes = (one.replace("tcp/", "tls/", 1) for one in (endpoints.plant, *endpoints.nodes))
+    return replace(endpoints, plant=plant, nodes=nodes)
+
+
 def _endpoint(address: str, port: int) -> str:
     return f"tcp/[{address}]:{port}" if ":" in address else f"tcp/{address}:{port}"
 
@@ -235,7 +286,7 @@ def _endpoint(address: str, port: int) -> str:
 # -- hosts --------------------------------------------------------------------------------------
 
 
-def over_hosts(hosts: Hosts) -> Endpoints:
+def over_hosts(hosts: Hosts, *, tls: bool = False) -> Endpoints:
     """The endpoints of a run over several hosts; UsageError names the key of what cannot be used.
 
     Only this machine's ports can be tried here; a node elsewhere says itself that it cannot listen.
@@ -254,7 +305,8 @@ def over_hosts(hosts: Hosts) -> Endpoints:
                 )
             used[endpoint] = f"node {index}"
     own, *nodes = used
-    return Endpoints(own, nodes)
+    endpoints = Endpoints(own, nodes)
+    return _with_tls(endpoints) if tls else endpoints
 
 
 def _host_base(hosts: Hosts, host: Host, count: int, used: dict[str, str]) -> int:

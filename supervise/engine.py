@@ -17,13 +17,13 @@ from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
 
+from analysis.one_thread import one_thread_in_children
 from supervise.children import ending
 from wire.child import die_with_parent, name_process
 from wire.errors import GainsRefusedError, OctarmError, UsageError
 
 _ENDING_S = 2.0
 _SIGNALS = {signal.SIGINT, signal.SIGTERM}
-_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 _REFUSALS: dict[str, type[OctarmError]] = {"usage": UsageError, "gains": GainsRefusedError}
 Say = Callable[[str, object], None]
 
@@ -36,7 +36,8 @@ class Engine:
     """One child that calls `work(*arguments, say)`; whatever is said arrives as (kind, content).
 
     A UsageError or GainsRefusedError of the work arrives as the kind "refused", any other error as "error";
-    `failure` makes exceptions of both. one_thread: linear algebra and solver keep to one processor.
+    `failure` makes exceptions of both. Linear algebra and solver keep to one thread: matrices this small take
+    longer on several, and their rounding depends on the number.
     """
 
     def __init__(
@@ -45,7 +46,6 @@ class Engine:
         arguments: tuple[Any, ...],
         *,
         name: str = "octarm-engine",
-        one_thread: bool = False,
     ) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, there = context.Pipe(duplex=False)
@@ -53,7 +53,7 @@ class Engine:
             target=_child, args=(there, os.getpid(), name, work, arguments), daemon=True
         )
         try:
-            with held_back(), _threads(one_thread):
+            with held_back(), one_thread_in_children():
                 self._process.start()
             there.close()
         except BaseException:  # also an interrupt that was held back
@@ -100,18 +100,6 @@ def held_back() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
-@contextmanager
-def _threads(one: bool) -> Iterator[None]:
-    """The environment that a child is started in; what the user has set stays."""
-    added = [name for name in _THREADS if one and name not in os.environ]
-    os.environ.update(dict.fromkeys(added, "1"))
-    try:
-        yield
-    finally:
-        for name in added:
-            del os.environ[name]
 
 
 def _child(

@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import tempfile
+import threading
 import traceback
 from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
@@ -19,11 +20,31 @@ from typing import Any, NoReturn
 import tyro
 
 from wire.errors import ExitCode, OctarmError
+from wire.limits import files_exhausted, refusal
+
+AGAIN_S = 0.01
+_decided: list[tuple[ExitCode, str]] = []
+"""See `decide`: one at most."""
 
 
 def serve(verbs: Mapping[str, Callable[..., int]], prog: str, description: str) -> NoReturn:
     """Run the verb that the command line names; ends the process with its exit code."""
+    _decided.clear()
+    before, sys.unraisablehook = sys.unraisablehook, _again_if_interrupted
+    try:
+        code = _serve(verbs, prog, description)
+    finally:
+        sys.unraisablehook = before
+    # What is decided stays decided while Python clears up.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    sys.exit(code)
+
+
+def _serve(verbs: Mapping[str, Callable[..., int]], prog: str, description: str) -> int:
     signal.signal(signal.SIGTERM, _interrupt)
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # see launcher.py
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         code: int = tyro.extras.subcommand_cli_from_dict(
             dict(verbs), prog=prog, description=description
@@ -32,8 +53,9 @@ def serve(verbs: Mapping[str, Callable[..., int]], prog: str, description: str) 
         print(f"{prog}: {error}", file=sys.stderr)
         code = int(error.exit_code)
     except KeyboardInterrupt:
-        print(f"{prog}: interrupted", file=sys.stderr)
-        code = int(ExitCode.INTERRUPTED)
+        decided, text = _decided.pop() if _decided else (ExitCode.INTERRUPTED, "interrupted")
+        print(f"{prog}: {text}", file=sys.stderr)
+        code = int(decided)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # nobody reads the output any more
         code = int(ExitCode.OK)
@@ -41,9 +63,25 @@ def serve(verbs: Mapping[str, Callable[..., int]], prog: str, description: str) 
         if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
             print(f"{prog}: {error.filename}: {error.strerror}", file=sys.stderr)
             sys.exit(int(ExitCode.USAGE))  # only what the user typed can be so long
+        if reason := refusal(error) or refusal(files_exhausted() or error):
+            print(f"{prog}: {reason}", file=sys.stderr)
+            sys.exit(int(ExitCode.USAGE))
         code = int(ExitCode.INTERNAL)
         print(f"{prog}: internal error: {error!r}; {_save_traceback()}", file=sys.stderr)
-    sys.exit(code)
+    return code
+
+
+def _again_if_interrupted(what: sys.UnraisableHookArgs) -> None:
+    """Ctrl-C while Python takes an object apart is printed and forgotten by it: it has to come again."""
+    if issubclass(what.exc_type, KeyboardInterrupt):
+        threading.Timer(AGAIN_S, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(what)
+
+
+def decide(code: ExitCode, text: str) -> None:
+    """Exit code and message of this process if it is interrupted from now on: a graver end has come before."""
+    _decided[:] = [(code, text)]
 
 
 def show_json(value: Mapping[str, Any]) -> None:

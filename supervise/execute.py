@@ -9,15 +9,21 @@ from __future__ import annotations
 import traceback
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from supervise.conductor import Conductor, Interrupted, log_of
 from supervise.endpoints import Endpoints, check_live_port, choose, over_hosts
+from supervise.entry import decide
 from supervise.options import RunOptions
-from supervise.plan import Plan, make_plan, new_run_id, prepare
+from supervise.own_directory import claim, tidy
+from supervise.plan import make_plan, new_run_id, prepare
 from supervise.state import Outcome
 from supervise.view import View, choose_view
 from wire.errors import ExitCode, UsageError
+from wire.limits import files_exhausted, make_room_for_files, refusal
+
+if TYPE_CHECKING:
+    from supervise.secured import Secured
 
 RECORDING = "recording.mcap"
 PLOT = "plot.png"
@@ -38,20 +44,30 @@ class Result:
 def execute(options: RunOptions, *, quiet: bool, plot: bool) -> Result:
     """Run the arm once. Raises OctarmError if it did not come to the first tick."""
     check_live_port(options.live_port)
+    if reason := make_room_for_files(-(-options.nodes // options.segments_per_process)):
+        raise UsageError(f"--nodes {options.nodes}: {reason}")
     prepared = prepare(options)
     run_id = new_run_id()
+    secured = _secured(options, run_id)
     endpoints = _meet(options)
     try:
-        directory, made = _make_directory(options.out, run_id)
+        directory = Path("runs") / run_id if options.out is None else options.out
+        made = claim(directory, log_of(directory).name)
+        directory = directory.absolute()
         with choose_view(prepared.course.ticks, quiet=quiet) as view:
             if options.live and not options.realtime:
                 view.note(
                     "--live: in lock-step the run is over as soon as it can be; to watch it add --realtime"
                 )
+            conductor: Conductor | None = None
             try:
-                outcome = _conduct(make_plan(prepared, endpoints, run_id, directory), view)
+                plan = make_plan(prepared, endpoints, run_id, directory, secured)
+                conductor = Conductor(plan, view)
+                outcome = _conduct(conductor)
             except BaseException:
-                _remove_if_empty(directory, made)
+                # Ctrl-C may also come when the processes have ended: then the recording is whole, and stays.
+                if conductor is None or not conductor.begun:
+                    _remove_if_empty(directory, made)
                 raise
             result = Result(outcome, directory, directory / RECORDING)
             if outcome.run_s > 0.0:
@@ -63,65 +79,48 @@ def execute(options: RunOptions, *, quiet: bool, plot: bool) -> Result:
     return result
 
 
+def _secured(options: RunOptions, run_id: str) -> Secured | None:
+    if options.keys is None:
+        return None
+    from supervise.secured import secure  # with `cryptography`, which other runs do without
+
+    return secure(options, options.keys, run_id)
+
+
 def _meet(options: RunOptions) -> Endpoints:
+    tls = options.keys is not None
     if options.placed_on is not None:
-        return over_hosts(options.placed_on)
-    return choose(options.nodes, options.transport, options.base_port, options.socket_dir)
+        return over_hosts(options.placed_on, tls=tls)
+    where = (options.transport, options.base_port, options.socket_dir)
+    return choose(options.nodes, *where, tls=tls, later=True)
 
 
-def _conduct(plan: Plan, view: View) -> Outcome:
-    with Conductor(plan, view) as conductor:
+def _conduct(conductor: Conductor) -> Outcome:
+    with conductor:
         try:
-            return conductor.run()
+            outcome = conductor.run()
         except Interrupted:
             text = "interrupted before the first tick"
             return Outcome(ExitCode.INTERRUPTED, text, 0, 0.0)
-
-
-def _make_directory(out: Path | None, run_id: str) -> tuple[Path, bool]:
-    """The run's own directory, and whether it was made here; nothing is ever written over."""
-    directory = Path("runs") / run_id if out is None else out
-    try:
-        made = not directory.exists()
-        directory.mkdir(parents=True, exist_ok=True)
-        occupied = next((file.name for file in directory.iterdir()), None)
-        if occupied is None:
-            occupied = _claim(log_of(directory))
-    except OSError as error:
-        raise UsageError(
-            f"--out {directory}: {error.strerror or error}; give a directory that can be written"
-        ) from None
-    if occupied is not None:
-        raise UsageError(
-            f"--out {directory}: there is something in it already ({occupied}); nothing is "
-            "written over, give another directory"
-        )
-    return directory.absolute(), made
-
-
-def _claim(log: Path) -> str | None:
-    """Make the run's log, empty; its name if another run was quicker to take the directory."""
-    try:
-        log.touch(exist_ok=False)
-    except FileExistsError:
-        return log.name
-    return None
+        if outcome.exit_code is ExitCode.SAFETY_STOP:  # said even if the summary is interrupted
+            decide(outcome.exit_code, f"{outcome.message}; interrupted before the summary")
+        return outcome
 
 
 def _remove_if_empty(directory: Path, made: bool) -> None:
     """Leave no empty directory behind a run that never began; keep what explains why."""
-    for file in directory.iterdir():
-        empty_log = file == log_of(directory) and file.stat().st_size == 0
-        if file.name == RECORDING or file.match("node-*.json") or empty_log:
-            file.unlink()
-    if made and not any(directory.iterdir()):
-        directory.rmdir()
+    if directory.is_dir():  # else somebody has removed it
+        for file in directory.iterdir():
+            if file.name == RECORDING or file.match("node-*.json"):
+                file.unlink()
+    tidy(directory, log_of(directory).name, made=made)
 
 
 def _conclude(result: Result, view: View, plot: bool) -> None:
     """Read the recording back: figures and plot."""
     outcome = result.outcome
     if not result.recording.exists():
+        _degrade(outcome, f"{result.recording} is gone: it or its directory was moved or deleted")
         return
     try:
         from analysis.recording import read_recording
@@ -133,9 +132,17 @@ def _conclude(result: Result, view: View, plot: bool) -> None:
             from analysis.plot import plot_recording
 
             target = result.directory / PLOT
-            plot_recording(recording, target)
-            result.plot = target
+            try:
+                plot_recording(recording, target)
+                result.plot = target
+            except UsageError as error:
+                _degrade(outcome, str(error))
     except Exception as error:
+        refused = refusal(error) or refusal(files_exhausted() or error)
+        if refused is not None:
+            _degrade(outcome, f"the run is recorded, but not summarised: {refused}")
+            result.summary = _own_facts(result)
+            return
         if outcome.exit_code is not ExitCode.OK:
             view.note(f"no summary of the broken-off run: {error}")
             return
@@ -145,7 +152,13 @@ def _conclude(result: Result, view: View, plot: bool) -> None:
         outcome.message = (
             f"the run is recorded, but its summary failed: {error}; see {log_of(result.directory)}"
         )
-    result.summary |= {
+    result.summary |= _own_facts(result)
+
+
+def _own_facts(result: Result) -> dict[str, Any]:
+    """What the launcher knows of the run."""
+    outcome = result.outcome
+    return {
         "run_s": outcome.run_s,
         "ticks_per_s": outcome.ticks / outcome.run_s if outcome.run_s > 0.0 else None,
         "recording": str(result.recording),
@@ -153,3 +166,10 @@ def _conclude(result: Result, view: View, plot: bool) -> None:
         "exit_code": int(outcome.exit_code),
         "message": outcome.message,
     }
+
+
+def _degrade(outcome: Outcome, message: str) -> None:
+    """Say that a run that went well otherwise left less than it should."""
+    if outcome.exit_code in (ExitCode.OK, ExitCode.DEGRADED):
+        outcome.exit_code = ExitCode.DEGRADED
+        outcome.message = "; ".join(filter(None, (outcome.message, message)))

@@ -8,7 +8,6 @@ with it.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import subprocess
 from collections import deque
@@ -17,6 +16,7 @@ from typing import IO, Any
 
 from supervise.children import FarNode, Process
 from supervise.hosts import Host
+from supervise.status_line import status_of
 from wire.errors import UsageError
 
 BEAT_S = 5.0
@@ -41,9 +41,8 @@ class FarZygote(Process):
         if self._popen.stderr is None:
             raise RuntimeError("the pipe of a start command's errors is missing")
         self.errors = self._popen.stderr.fileno()
-        self._log = log
+        self._log: IO[bytes] | None = log
         self._last_words: deque[str] = deque(maxlen=SHOWN_LINES)
-        self._unsent = b""
         self._sent_at = monotonic()
         self._known = {"zygote", *(f"node {index}" for index in host.indices)}
         self.nodes: list[FarNode] = []
@@ -60,15 +59,16 @@ class FarZygote(Process):
 
     def push(self) -> bool:
         """Write what has room, without waiting; whether all of it went."""
-        try:
-            written = os.write(self.control.fileno(), self._unsent)
-            self._unsent = self._unsent[written:]
+        before = len(self._unsent)
+        done = super().push()
+        if len(self._unsent) < before:
             self._sent_at = monotonic()
-        except BlockingIOError:
-            pass
-        except (BrokenPipeError, ValueError):  # its end is noticed elsewhere
-            self._unsent = b""
-        return not self._unsent
+        return done
+
+    @property
+    def owed(self) -> bool:
+        """Nothing is sent before somebody reads there."""
+        return self.up and super().owed
 
     def beat(self) -> None:
         """Say from time to time that the launcher lives."""
@@ -85,32 +85,10 @@ class FarZygote(Process):
 
     # -- from the host ------------------------------------------------------------------------------
 
-    def lines(self) -> list[dict[str, Any]] | None:
-        """Status lines of the zygote and its nodes; anything else, a greeting for example, is logged."""
-        try:
-            data = os.read(self.status, 1 << 20)
-        except BlockingIOError:
-            return []
-        if not data:
-            return None
-        *whole, self._partial = (self._partial + data).split(b"\n")
-        said = []
-        for line in whole:
-            status = self._status(line)
-            if status is None:
-                self._note(line)
-            else:
-                said.append(status)
-        return said
-
     def _status(self, line: bytes) -> dict[str, Any] | None:
-        try:
-            status = json.loads(line)
-        except ValueError:
-            return None
-        if not isinstance(status, dict) or "event" not in status:
-            return None
-        if not any(status.get("from") == name for name in self._known):
+        """That of the zygote or one of its nodes; anything else, a greeting for example, is logged."""
+        status = status_of(line)
+        if status is None or status["from"] not in self._known:
             return None
         if status["from"] == "zygote":
             status["from"] = self.name
@@ -129,8 +107,7 @@ class FarZygote(Process):
     def _note(self, line: bytes) -> None:
         if text := line.decode(errors="replace").strip():
             self._last_words.append(text)
-        self._log.write(f"{self.name}: ".encode() + line + b"\n")
-        self._log.flush()
+        super()._note(line)
 
     @property
     def last_words(self) -> str:

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import msgspec
 
-from wire.errors import UsageError
+from wire.errors import UsageError, shown
+from wire.files import TEXT_BYTES, read_limited
 
 REMOTE_BASE_PORT = 17_000
 """Of hosts whose ports cannot be tried from here."""
@@ -46,6 +47,7 @@ class HostTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     python: str | None = None
     base_port: int | None = None
     same_clock: bool = False
+    keys: str | None = None
 
 
 class HostsFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -73,6 +75,8 @@ class Host:
     """Of its first node; None: chosen among this machine's free ones."""
     same_clock: bool = False
     """Its monotonic clock is this machine's."""
+    keys: str | None = None
+    """Directory of its processes' keys there, from `directory` on; None: as on this machine."""
 
     def __post_init__(self) -> None:
         if not NAME.fullmatch(self.name):
@@ -81,7 +85,9 @@ class Host:
             )
         _check_address("address", self.address)
         if self.nodes < 1:
-            raise UsageError(f"nodes: expected at least 1, got {self.nodes}")
+            raise UsageError(f"nodes: expected at least 1, got {shown(self.nodes)}")
+        if self.nodes > HIGHEST_PORT:
+            raise UsageError(f"nodes: expected at most {HIGHEST_PORT}, got {shown(self.nodes)}")
         for key, word in (("directory", self.directory), ("python", self.python)):
             if not WORD.fullmatch(word) or word.startswith("-"):
                 raise UsageError(
@@ -140,12 +146,12 @@ def read_hosts(path: Path, nodes: int) -> Hosts:
     Raises UsageError naming the file, the key, what was expected and what was found.
     """
     try:
-        table = msgspec.toml.decode(path.read_bytes(), type=HostsFile)
+        table = msgspec.toml.decode(read_limited(path, TEXT_BYTES), type=HostsFile)
     except OSError as error:
         raise UsageError(
             f"--hosts {path}: {error.strerror or error}; give a hosts file, see examples/hosts.toml"
         ) from None
-    except (msgspec.DecodeError, UnicodeDecodeError, OverflowError, RecursionError) as error:
+    except (msgspec.DecodeError, ValueError, OverflowError, RecursionError) as error:
         raise UsageError(f"hosts file {path}: {error}") from None
     try:
         return _hosts(path, table, nodes)
@@ -203,6 +209,7 @@ def _host(entry: HostTable, first: int) -> Host:
         python=PYTHON if entry.python is None else entry.python,
         base_port=base_port,
         same_clock=entry.same_clock,
+        keys=entry.keys,
     )
 
 
@@ -225,4 +232,4 @@ def _check_address(key: str, address: str) -> None:
 def _check_port(key: str, port: int, count: int) -> None:
     highest = HIGHEST_PORT + 1 - count
     if not LOWEST_PORT <= port <= highest:
-        raise UsageError(f"{key}: expected {LOWEST_PORT}..{highest}, got {port}")
+        raise UsageError(f"{key}: expected {LOWEST_PORT}..{highest}, got {shown(port)}")

@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING
 
 from supervise.shipped import DEFAULT_GAINS
 from wire.errors import UsageError
+from wire.run_config import MOST_TICKS, SHORTEST_TICK_S
 
 if TYPE_CHECKING:
     from supervise.hosts import Hosts
 
 MOST_NODES = 1000
-MOST_TICKS = 10_000_000
-"""A recording of so many has tens of gigabytes."""
 DEFAULT_SCENARIO = "hold"
 
 
@@ -41,6 +40,7 @@ class RunOptions:
     noise_velocity: float | None = None
     noise_curvature: float | None = None
     plant_cells: int | None = None
+    plant_model: str | None = None
     spacing: str = "equispaced"
     out: Path | None = None
     transport: str = "unix"
@@ -56,7 +56,10 @@ class RunOptions:
     period_s: float | None = None
     """None: the tick, that is one second of the arm's in one of the clock's."""
     hold_ticks: int = 2
+    restart: bool = False
     hosts: Path | None = None
+    keys: Path | None = None
+    """None: no certificates."""
     live: bool = False
     live_port: int | None = None
     """None: any that is free."""
@@ -66,6 +69,7 @@ class RunOptions:
         from plant.grid import plant_cells
         from plant.initial import check_name
         from plant.noise import SensorNoise
+        from plant.truncated_force import EXACT, check_model
 
         _at_least("--nodes", self.nodes, 2, "a chain needs a root and a tip segment")
         if self.nodes > MOST_NODES:
@@ -76,6 +80,11 @@ class RunOptions:
                 raise UsageError(f"--ticks: expected at most {MOST_TICKS}, got {self.ticks}")
         _at_least("--seed", self.seed, 0, "any whole number from 0 on")
         _positive("--tick", self.tick_s, "seconds")
+        if self.tick_s < SHORTEST_TICK_S:
+            raise UsageError(
+                f"--tick: expected {SHORTEST_TICK_S:g} s or more, got {self.tick_s!r}; instants are recorded "
+                "in nanoseconds"
+            )
         _positive("--start-timeout", self.start_timeout_s, "seconds")
         _positive("--deadline", self.deadline_s, "seconds")
         _at_least("--segments-per-process", self.segments_per_process, 1, "or there is no node")
@@ -101,8 +110,14 @@ class RunOptions:
         amplitude = self.disturbance_amplitude
         DisturbanceSpec(self.disturbance or "none", 1.0 if amplitude is None else amplitude)
         SensorNoise(self.seed, self.noise_velocity or 0.0, self.noise_curvature or 0.0)
-        plant_cells(self.nodes, self.plant_cells)
+        if self.plant_model is not None:
+            check_model(self.plant_model)
+            plant_cells(self.nodes, self.plant_cells, exact=self.plant_model == EXACT)
         _ = self.placed
+        if self.keys is not None and self.socket_dir is not None:
+            raise UsageError(
+                "--socket-dir: with --keys processes meet over TLS; leave one of them out"
+            )
         if self.placed_on is not None:
             for name, value in (("--base-port", self.base_port), ("--socket-dir", self.socket_dir)):
                 if value is not None:

@@ -10,14 +10,15 @@ import math
 import os
 import secrets
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from deploy import Deployment, SegmentGrid, deploy
+from deploy.gaps import refuse_growing_gaps
 from deploy.node_configs import node_configs
 from deploy.path import References, make_references
 from supervise.endpoints import Endpoints
@@ -27,8 +28,10 @@ from supervise.options import RunOptions
 from supervise.origin import git_revision, machine_facts, versions
 from supervise.scenario import Course, settle
 from supervise.spacing import spacing_name
+from wire.access import LIVE, PLANT, RECORDER, node_name
 from wire.artefact import GainsArtefact, digest, read_artefact
 from wire.channels import BATCH_TICKS, FLUSH_S, FORMAT_VERSION, NODES_ATTACHMENT
+from wire.config_json import dumps
 from wire.errors import UsageError
 from wire.placement import FIFO_PRIORITY
 from wire.run_config import (
@@ -40,8 +43,10 @@ from wire.run_config import (
     RecorderConfig,
     RunConfig,
     SchedulingConfig,
-    dumps,
 )
+
+if TYPE_CHECKING:
+    from supervise.secured import Secured
 
 CORES = 2
 """Two sweeps run towards each other; more cores would only add wake-ups across cores (runtime
@@ -94,6 +99,8 @@ def prepare(options: RunOptions) -> Prepared:
     for name in course.visited:
         artefact.setpoint_index(name)
     deployment = deploy(artefact, options.nodes, options.tick_s, options.placed)
+    if options.restart:
+        refuse_growing_gaps(artefact, deployment, course.visited, options.segments_per_process)
     if not course.control:
         deployment = deployment.without_control()
     references = make_references(
@@ -132,8 +139,14 @@ def scheduling(artefact: GainsArtefact, course: Course) -> SchedulingConfig:
     )
 
 
-def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: Path) -> Plan:
-    """Build every process's configuration."""
+def make_plan(
+    prepared: Prepared,
+    endpoints: Endpoints,
+    run_id: str,
+    directory: Path,
+    secured: Secured | None = None,
+) -> Plan:
+    """Build every process's configuration; `secured` has the identities of a run with --keys."""
     options, course, artefact = prepared.options, prepared.course, prepared.artefact
     deployment, references = prepared.deployment, prepared.references
     active = artefact.setpoint_index(course.setpoint)
@@ -166,6 +179,8 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         energy_weights=tuple(map(tuple, deployment.energy_weights.tolist())),
         segments_per_process=options.segments_per_process,
         pace=_pace(options),
+        restart=options.restart,
+        plant_model=course.plant_model,
     )
     epoch_ns = time.monotonic_ns()
     cores = _cores(nodes) if options.pin else [None] * nodes
@@ -174,7 +189,9 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
     # Of another machine neither clock nor cores are known.
     elsewhere = {i for host in hosts if host.own_clock for i in host.indices}
 
-    def links(listen: list[str], connect: list[str], node: int | None = None) -> LinkConfig:
+    def links(
+        name: str, listen: list[str], connect: list[str], node: int | None = None
+    ) -> LinkConfig:
         return LinkConfig(
             listen=tuple(listen),
             connect=tuple(connect),
@@ -183,12 +200,13 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             epoch_ns=None if node in elsewhere else epoch_ns,
             cpu=None if node is None or node in elsewhere else cores[node],
             fifo=FIFO_PRIORITY if options.fifo else None,
+            tls=None if secured is None else secured.tls(name, node),
         )
 
     def node_links(own: range) -> LinkConfig:
         listen = [endpoints.nodes[own[-1]]] if own[-1] < nodes - 1 else []
         connect = [endpoints.plant, *([endpoints.nodes[own[0] - 1]] if own[0] > 0 else [])]
-        return links(listen, connect, own[0])
+        return links(node_name(own[0]), listen, connect, own[0])
 
     configs = node_configs(run, deployment, references, node_links)
     return Plan(
@@ -204,7 +222,7 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
                 for i in range(len(run.setpoint_names))
             ),
             batch_ticks=BATCH_TICKS,
-            links=links([endpoints.plant], []),
+            links=links(PLANT, [endpoints.plant], []),
         ),
         recorder=RecorderConfig(
             run=run,
@@ -217,9 +235,9 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             attachments={
                 "gains.json": options.gains.read_text(),
                 "run.json": dumps(run),
-                NODES_ATTACHMENT: f"[{','.join(map(dumps, configs))}]",
+                NODES_ATTACHMENT: f"[{','.join(map(dumps, map(_public, configs)))}]",
             },
-            links=links([], [endpoints.plant]),
+            links=links(RECORDER, [], [endpoints.plant]),
         ),
         live=None
         if not options.live
@@ -228,7 +246,7 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
             artefact,
             deployment,
             references,
-            links=links([], [endpoints.plant]),
+            links=links(LIVE, [], [endpoints.plant]),
             port=options.live_port or 0,
             elsewhere=elsewhere,
             period_s=run.tick_s if run.pace is None else run.pace.period_s,
@@ -241,6 +259,11 @@ def make_plan(prepared: Prepared, endpoints: Endpoints, run_id: str, directory: 
         ),
         start_timeout_s=options.start_timeout_s,
     )
+
+
+def _public(config: NodeConfig) -> NodeConfig:
+    """What a recording, which others read while the run goes on, may have of a configuration."""
+    return replace(config, links=replace(config.links, tls=None))
 
 
 def _pace(options: RunOptions) -> PaceConfig | None:

@@ -36,7 +36,7 @@ def plot(
         out: File to write, .png, .pdf or .svg; default panels.png or <the one panel>.png beside the recording.
         only: Panels to draw, default all: shapes, estimation, tip, curvature, curvature-error, deviation,
             curvature-course, velocity-course, regulated, commands, feedback, energy, sweeps, sweep-course,
-            messages.
+            messages, health.
         width: Of the figure in inches; default 14, for one panel 9.
         dpi: Dots an inch; in .pdf and .svg only of the maps.
         force: Write over an existing file.

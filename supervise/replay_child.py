@@ -14,7 +14,8 @@ from typing import IO, Self
 
 from supervise.children import Handle, Process, ending, module
 from wire.child import Deadline
-from wire.run_config import NodeConfig, dumps
+from wire.config_json import dumps
+from wire.run_config import NodeConfig
 
 GRACE_S = 1.0
 """The node ends when it is told; after so long it is made to."""

@@ -19,8 +19,9 @@ from analysis.replay_check import Span
 from supervise.children import Process, ending, module
 from supervise.live_config import live_config
 from wire.child import Deadline
+from wire.config_json import dumps
 from wire.errors import OctarmError
-from wire.run_config import LinkConfig, LiveConfig, dumps
+from wire.run_config import LinkConfig, LiveConfig
 
 START_S = 20.0
 GRACE_S = 3.0

@@ -1,11 +1,13 @@
 """The other end of all links of one node process, for a replay: plant, neighbours and recorder at once.
 
 Between `supervise.replay_node`, which starts and ends everything, and Zenoh: recorded messages out, tick by
-tick, answers and telemetry in.
+tick, answers and telemetry in. What did not come in the run is not sent, and the process learns of it as in the
+run: by a neighbour's liveliness token that vanishes, or by messages of a later tick.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from dataclasses import dataclass, field
 from functools import partial
@@ -13,61 +15,46 @@ from time import monotonic_ns
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
 
-from analysis.replay import Feed, Replayed, Rows, name_of, nothing_yet
+from analysis.lives import Life
+from analysis.replay import Feed, Replayed, name_of
 from node.configured import sweeps_of
 from supervise.replay_child import StartedNode, Turns
+from supervise.replay_result import NodeReplay
 from wire import session as zsession
+from wire.channels import Degraded
 from wire.child import Deadline
 from wire.errors import OctarmError, StartUpTimeoutError
 from wire.keys import Keys
 from wire.messages import (
+    PARTIAL,
     PLANT,
     Incoming,
     Kind,
     Numbers,
-    Reason,
     RejectedError,
     Stop,
-    decode_batch,
-    decode_counters,
     encode_numbers,
     encode_stop,
-    kind_of,
     run_tag,
 )
 from wire.run_config import NodeConfig
 
-Array = npt.NDArray[np.float64]
-
 START_S = 30.0
 LAST_WORD_S = 5.0
 """How long to wait for rows and counters after the stop message; less if the node is not well."""
+AGAIN_S = 0.25
+"""After so long without an answer a neighbour that should have vanished does so again."""
+MOMENT_S = 0.02
 CAPACITY = 8192
 """Batches that may wait in memory."""
-
-
-@dataclass
-class NodeReplay:
-    """What a real process gave."""
-
-    replayed: Replayed
-    latencies_us: Array
-    """Per tick, from the first message put to the command received."""
-    counters: dict[int, dict[str, int]]
-    """Its last word, per segment."""
-
-    @property
-    def rejected(self) -> int:
-        """Messages that the process refused."""
-        return sum(one.get("rejected_messages", 0) for one in self.counters.values())
 
 
 @dataclass
 class _Answers:
     """What has come of a tick, on Zenoh's threads."""
 
+    tick: int
     raw: dict[str, bytes] = field(default_factory=dict)
     at_ns: int = 0
     """When the command came."""
@@ -83,7 +70,17 @@ class Peer:
         self._name = name_of(config)
         self._sweeps = sweeps_of(config)
         self._turns = turns
-        self._answers = _Answers()
+        self._answers = _Answers(0)
+        self._given_up: dict[int, _Answers] = {}
+        """Of ticks that the process gives up: what it sent before it did."""
+        self._tokens: dict[str, Any] = {}
+        """Of the neighbours' processes, while they are there, by the sums that come from them."""
+        self._cut: set[str] = set()
+        """Sums that the process does not wait for, having bridged them in the tick before."""
+        self._vanished: set[str] = set()
+        """Sums that do not come in this tick because whoever they come from is gone."""
+        self.unwanted = 0
+        """Sums that it was given too late, so that it must refuse them."""
         self._late: deque[str] = deque()
         """Messages that nobody waited for."""
         self._present: set[int] = set()
@@ -97,6 +94,7 @@ class Peer:
 
     def __exit__(self, *_: object) -> None:
         self._publishers.clear()
+        self._tokens.clear()
         self._keep.clear()
         del self._records
 
@@ -129,6 +127,17 @@ class Peer:
         )
         for name, key in send.items():
             self._publishers[name] = zsession.control_publisher(session, key)
+        self._appear("forward", "backward")
+        if config.joins:
+            sides = (
+                ("forward", first.first, first.index - 1),
+                ("backward", last.last, last.index + 1),
+            )
+            for name, nobody, segment in sides:
+                if not nobody:
+                    key = keys.state(config.index, segment)
+                    publisher = zsession.control_publisher(session, key)
+                    self._publishers[f"state {name}"] = publisher
         self._publishers["stop"] = zsession.control_publisher(session, keys.stop)
         for publisher in self._publishers.values():
             self._keep.append(
@@ -143,7 +152,8 @@ class Peer:
         limit = Deadline(START_S)
         while True:
             missing = [n for n, p in self._publishers.items() if not zsession.matched(p)]
-            if self._config.index in self._present and process.ready and not missing:
+            there = self._config.joins or self._config.index in self._present
+            if there and process.ready and not missing:
                 return
             if process.failure or process.ended:
                 why = process.failure or f"it {process.ended}"
@@ -158,51 +168,122 @@ class Peer:
 
     # -- the replay -------------------------------------------------------------------------------
 
-    def replay(self, feed: Feed, rows: Rows, process: StartedNode, deadline_s: float) -> NodeReplay:
-        """Feed all ticks, then stop the node in order and take its last records."""
-        columns = [rows.of[i].shape[1] for i in feed.segments]
-        replayed = nothing_yet(feed, self._sweeps, columns)
-        out = NodeReplay(replayed, np.zeros(0), {})
+    def replay(
+        self, feed: Feed, life: Life, process: StartedNode, deadline_s: float, out: NodeReplay
+    ) -> None:
+        """Feed the ticks of a life, then stop the node in order and take its last records."""
+        replayed = out.replayed
         latencies = []
-        for k in feed.ticks:
-            began_ns = self._feed(feed, k)
-            if not self._await(k, process, deadline_s, replayed):
+        before = -1
+        for k in life.ticks:
+            joins = life.joined and before < 0
+            if joins:
+                self._tell_states(feed, k)
+            began_ns = self._feed(feed, k, before)
+            before = k
+            if feed.flags[k] & int(Degraded.HELD):
+                self._given_up[k] = self._answers
+            elif not self._await(k, process, deadline_s, replayed):
                 break
-            latencies.append((self._answers.at_ns - began_ns) * 1e-3)
-            replayed.broke_off = self._take(k, int(feed.setpoints[k]), replayed)
+            else:
+                latencies.append((self._answers.at_ns - began_ns) * 1e-3)
+                replayed.broke_off = self._take(self._answers, feed, replayed)
             if replayed.broke_off is not None:
                 break
             replayed.ticks += 1
             self._drain(out)
-        out.latencies_us = np.array(latencies)
-        self._finish(out, process, feed.ticks[-1] + 1 if feed.ticks else 0)
-        return out
+        out.latencies_us = np.concatenate([out.latencies_us, latencies])
+        if before in self._given_up and not (replayed.broke_off or replayed.ended):
+            self._answers = _Answers(before + 1)
+            self._put("measurement", feed, before, as_tick=before + 1)  # with which it gives it up
+        self._finish(out, process, before + 1)
+        for answers in self._given_up.values():
+            replayed.broke_off = replayed.broke_off or self._take(answers, feed, replayed)
 
-    def _feed(self, feed: Feed, k: int) -> int:
-        """Send a tick's messages; the instant of the first one."""
-        setpoint = int(feed.setpoints[k])
-        self._answers = _Answers()
-        inputs = {
+    def _feed(self, feed: Feed, k: int, before: int) -> int:
+        """Send what came in a tick, and let the process know what does not come; the instant of the first one.
+
+        What it has bridged, it does not wait for in the tick after: then the sums must be there first.
+        """
+        flags = int(feed.flags[k])
+        self._answers = _Answers(k)
+        names = ["measurement", "forward", "backward"]
+        if before >= 0 and feed.flags[before]:
+            names = names[1:] + names[:1]
+        absent = {
+            "measurement": flags & int(Degraded.MEASUREMENT_HELD),
+            "forward": flags & int(Degraded.FORWARD_BRIDGED),
+            "backward": flags & int(Degraded.BACKWARD_BRIDGED),
+        }
+        held = bool(flags & int(Degraded.HELD))
+        missing = {name for name in ("forward", "backward") if absent[name]}
+        self._appear(*(name for name in ("forward", "backward") if not absent[name]))
+        began_ns = monotonic_ns()
+        for name in names:
+            if name == "measurement" and held and missing and missing <= self._cut:
+                # Somebody was waited for: a sum that came too late had shown that its sender is there.
+                self._put(min(missing), feed, before, as_tick=before)
+                self.unwanted += 1
+            if not absent[name]:
+                self._put(name, feed, k)
+            elif not (held or name in self._cut) and name in self._tokens:
+                self._tokens.pop(name).undeclare()
+        self._cut = missing
+        self._vanished = set() if held else missing
+        return began_ns
+
+    def _put(self, name: str, feed: Feed, k: int, as_tick: int | None = None) -> None:
+        """Send one recorded message."""
+        kind, sender, values = {
             "measurement": (Kind.MEASUREMENT, PLANT, feed.measurement),
             "forward": (Kind.FORWARD_SUM, self._config.index - 1, feed.forward),
             "backward": (Kind.BACKWARD_SUM, self._config.last + 1, feed.backward),
-        }
-        messages = [
-            (
-                self._publishers[name],
-                encode_numbers(kind, self._run, k, sender, setpoint, values[k].tolist()),
-            )
-            for name, (kind, sender, values) in inputs.items()
-            if name in self._publishers
-        ]
-        began_ns = monotonic_ns()
-        for publisher, raw in messages:
-            publisher.put(raw)
-        return began_ns
+        }[name]
+        if name not in self._publishers:
+            return
+        setpoint = int(feed.setpoints[k])
+        if name == "forward" and feed.flags[k] & int(Degraded.PARTIAL):
+            setpoint |= PARTIAL
+        tick = k if as_tick is None else as_tick
+        raw = encode_numbers(kind, self._run, tick, sender, setpoint, values[k].tolist())
+        self._publishers[name].put(raw)
+
+    def _appear(self, *names: str) -> None:
+        """The neighbours that sums of these names come from are there; without one at the arm's ends."""
+        config, liveliness = self._config, self._session.liveliness()
+        processes = {"forward": config.left, "backward": config.last + 1}
+        for name in names:
+            there = name in self._tokens or (name == "backward" and self._sweeps[-1].last)
+            if processes[name] >= 0 and not there:
+                key = self._keys.ready(processes[name])
+                self._tokens[name] = liveliness.declare_token(key)
+
+    def _vanish(self) -> None:
+        """Let the neighbours that the process is to do without vanish once more: of a token that comes and goes
+        at once, neither may be told."""
+        for name in self._vanished:
+            self._appear(name)
+            self._turns.turn(MOMENT_S)
+            if name in self._tokens:
+                self._tokens.pop(name).undeclare()
+
+    def _tell_states(self, feed: Feed, k: int) -> None:
+        """Be the neighbours of a replacement: with both in the state that it began with, so does it again."""
+        (sweep,) = sweeps_of(self._config)
+        sweep.join(k, int(feed.setpoints[k]), feed.states[k, 0])
+        deviation = sweep.row.state.tolist()
+        for name, sender in (("forward", sweep.index - 1), ("backward", sweep.index + 1)):
+            if (publisher := self._publishers.get(f"state {name}")) is not None:
+                setpoint = int(feed.setpoints[k])
+                raw = encode_numbers(Kind.STATE, self._run, k, sender, setpoint, deviation)
+                publisher.put(raw)
 
     def _answered(self, name: str, raw: bytes) -> None:
         """On Zenoh's thread: keep the answer."""
         at_ns, answers = monotonic_ns(), self._answers
+        with contextlib.suppress(RejectedError):  # else it is looked at with the tick that goes on
+            tick = self._incoming[name].decode(raw).tick
+            answers = self._given_up.get(tick, answers)
         if name in answers.raw:
             self._late.append(name)
         else:
@@ -214,7 +295,7 @@ class Peer:
 
     def _await(self, k: int, process: StartedNode, deadline_s: float, into: Replayed) -> bool:
         """Wait for all answers of a tick; False, and it is noted why, if they do not come."""
-        limit = Deadline(deadline_s)
+        limit, again = Deadline(deadline_s), Deadline(AGAIN_S)
         while len(self._answers.raw) < len(self._incoming):
             if process.failure:  # in the run it had nothing to complain of
                 into.broke_off = f"{self._name} failed: {process.failure}{process.last_words()}"
@@ -227,13 +308,21 @@ class Peer:
                 what = " and no ".join(missing)
                 into.ended = f"tick {k}: {self._name} gave no {what} within {deadline_s:g} s"
                 return False
-            self._turns.turn(min(0.5, limit.left))
+            self._turns.turn(min(0.5, limit.left, again.left))
+            if again.passed:
+                again = Deadline(AGAIN_S)
+                self._vanish()
         return True
 
-    def _take(self, k: int, setpoint: int, into: Replayed) -> str | None:
+    def _take(self, answers: _Answers, feed: Feed, into: Replayed) -> str | None:
         """Put a tick's answers where they belong; what is wrong with them, apart from numbers."""
+        k, setpoint = answers.tick, int(feed.setpoints[answers.tick])
+        if k in self._given_up and "command" in answers.raw:
+            return (
+                f"tick {k}: {self._name} sent its command, although the run had given the tick up"
+            )
         place = {"command": into.commands, "forward": into.forward, "backward": into.backward}
-        for name, raw in self._answers.raw.items():
+        for name, raw in answers.raw.items():
             try:
                 message: Numbers = self._incoming[name].decode(raw)
             except RejectedError as error:
@@ -246,6 +335,8 @@ class Peer:
                     f"expected {setpoint}"
                 )
             place[name][k] = message.values
+            if name == "forward":
+                into.partial[k] = int(Degraded.PARTIAL) if message.partial else 0
         if self._late:
             return f"tick {k}: {self._name} sent a second {self._late[0]} message"
         return None
@@ -256,24 +347,10 @@ class Peer:
         """Take the rows and counters that have come."""
         while (sample := self._records.try_recv()) is not None:
             try:
-                self._record(bytes(sample.payload), out)
+                out.take(bytes(sample.payload), self._run)
             except RejectedError as error:
                 text = f"{self._name} sent telemetry that is none ({error})"
                 out.replayed.broke_off = out.replayed.broke_off or text
-
-    def _record(self, raw: bytes, out: NodeReplay) -> None:
-        if kind_of(raw) is Kind.COUNTERS:
-            sender, _, counters = decode_counters(raw, self._run)
-            out.counters[sender] = counters
-            return
-        kept = out.replayed.rows
-        batch = decode_batch(raw, self._run, {i: rows.shape[1] for i, rows in kept.items()})
-        rows, end = kept[batch.sender], batch.tick + len(batch.rows)
-        if end > len(rows):
-            raise RejectedError(
-                Reason.EARLY, f"expected ticks up to {len(rows) - 1}, got {end - 1}"
-            )
-        rows[batch.tick : end] = batch.rows
 
     def _finish(self, out: NodeReplay, process: StartedNode, tick: int) -> None:
         """Stop the node as the plant does, and wait for its last rows and counters."""

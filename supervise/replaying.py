@@ -239,6 +239,8 @@ def _text(story: Story, comparison: Comparison, facts: dict[str, Any]) -> str:
     if facts.get("checksums_compared"):
         same, total = facts["checksums_equal"], facts["checksums_compared"]
         rows.append(("", f"{same} of {total} checksums over all messages of a kind"))
+    elif "node" in facts and story.recording.format_version < 5:
+        rows.append(("", "the run's checksums are of messages of an earlier version: not compared"))
     if "latency_us" in facts and facts["latency_us"]["p50"] is not None:
         p50, p99 = facts["latency_us"]["p50"], facts["latency_us"]["p99"]
         rows.append(("latency", f"p50 {p50:.0f} us, p99 {p99:.0f} us from feeding to the command"))

@@ -18,10 +18,12 @@ from plant.disturbance import DisturbanceSpec
 from plant.grid import plant_cells
 from plant.initial import check_name
 from plant.noise import SensorNoise
-from supervise.options import MOST_TICKS, RunOptions
+from plant.truncated_force import EXACT, check_model
+from supervise.options import RunOptions
 from supervise.shipped import SCENARIOS
 from wire.errors import UsageError
-from wire.run_config import DisturbanceConfig, LegConfig, NoiseConfig
+from wire.files import TEXT_BYTES, read_limited
+from wire.run_config import MOST_TICKS, DisturbanceConfig, LegConfig, NoiseConfig
 
 T = TypeVar("T")
 
@@ -71,6 +73,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     control: bool = True
     plant_cells: int | None = None
     """Of the emulated arm's grid; None for the run's default."""
+    plant_model: str = EXACT
+    """See plant.truncated_force."""
     legs: tuple[LegTable, ...] = ()
     disturbance: DisturbanceTable = DisturbanceTable()
     noise: NoiseTable = NoiseTable()
@@ -96,7 +100,7 @@ def read_scenario(name: str) -> Scenario:
             )
         path = SCENARIOS / f"{name}.toml"
     try:
-        raw = path.read_bytes()
+        raw = read_limited(path, TEXT_BYTES)
     except OSError as error:
         raise UsageError(
             f"--scenario {name}: {error.strerror or error}; give a scenario file, or the name of one: "
@@ -104,7 +108,7 @@ def read_scenario(name: str) -> Scenario:
         ) from None
     try:
         scenario = msgspec.toml.decode(raw, type=Scenario)
-    except (msgspec.DecodeError, UnicodeDecodeError, OverflowError, RecursionError) as error:
+    except (msgspec.DecodeError, ValueError, OverflowError, RecursionError) as error:
         raise UsageError(f"scenario {path}: {error}") from None
     try:
         _check(scenario)
@@ -130,10 +134,11 @@ def _check(scenario: Scenario) -> None:
     if not scenario.duration_s > 0.0:
         raise UsageError("it takes 0 s; give a hold_s or legs")
     check_name(scenario.initial)
+    check_model(scenario.plant_model)
     DisturbanceSpec(**msgspec.structs.asdict(scenario.disturbance))
     SensorNoise(0, scenario.noise.velocity_y_m_per_s, scenario.noise.curvature_per_m)
     if scenario.plant_cells is not None:
-        plant_cells(1, scenario.plant_cells)
+        plant_cells(1, scenario.plant_cells, exact=scenario.plant_model == EXACT)
     for name in ("hysteresis_deg", "bump_s"):
         value = getattr(scenario.scheduling, name)
         if not (math.isfinite(value) and (value > 0.0 or (value == 0.0 and name != "bump_s"))):
@@ -158,6 +163,7 @@ class Course:
     control: bool
     ticks: int
     plant_cells: int
+    plant_model: str
     first_hold_s: float
     legs: tuple[LegConfig, ...]
     disturbance: DisturbanceConfig
@@ -189,16 +195,18 @@ def settle(options: RunOptions) -> Course:
                 f"{options.tick_s:g} s, got {leg.move_s!r}"
             )
     noise = scenario.noise
-    cells = options.plant_cells
-    if cells is None and scenario.plant_cells is not None:
-        cells = max(scenario.plant_cells, plant_cells(options.nodes, None))
+    model = _given(options.plant_model, scenario.plant_model)
+    exact, cells = model == EXACT, options.plant_cells
+    if cells is None and scenario.plant_cells is not None and model == scenario.plant_model:
+        cells = max(scenario.plant_cells, plant_cells(options.nodes, None, exact=exact))
     return Course(
         told=scenario,
         setpoint=_given(options.setpoint, scenario.start),
         initial=_given(options.initial, scenario.initial),
         control=scenario.control,
         ticks=_ticks(scenario, options.tick_s) if options.ticks is None else options.ticks,
-        plant_cells=plant_cells(options.nodes, cells),
+        plant_cells=plant_cells(options.nodes, cells, exact=exact),
+        plant_model=model,
         first_hold_s=scenario.hold_s,
         legs=tuple(LegConfig(leg.to, leg.through, leg.move_s, leg.hold_s) for leg in scenario.legs),
         disturbance=DisturbanceConfig(**disturbance),

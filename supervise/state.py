@@ -17,6 +17,11 @@ SHOWN = 6
 """Causes that a message lists before it says how many more there are."""
 
 
+PASSIVE_TICKS = 20
+PASSIVE_S = 1.0
+"""A plant watches a passive arm for so many ticks (plant.process.SAFE_TICKS), and needs a second to stop."""
+
+
 @dataclass
 class Outcome:
     """How a run ended."""
@@ -51,13 +56,26 @@ class RunState:
     closed: dict[str, Any] | None = None
     """The recorder's totals, once its file is closed."""
     recorder_spoke: float = 0.0
+    plant_passive: float | None = None
+    """Until when the plant may watch a passive arm, on the monotonic clock; None before it is."""
+    passive_text: str = ""
+    """Why the arm is passive, in the plant's words."""
+    unrecorded: str = ""
+    """Why nothing is recorded any more, in the recorder's words."""
+    unheard_progress: int = 0
+    """So often the plant has told of its progress since the recorder last said a word."""
+    gave_up: ExitCode | None = None
+    """Exit code of the first process that gave up."""
     ticks: int = 0
+    refused: dict[tuple[str, str], int] = field(default_factory=dict)
+    """Whom a process did not let in, and how often: by the process and by what was wrong."""
 
     def hear(self, line: dict[str, Any]) -> None:
         """Take one status line into account."""
         name, event = line["from"], line["event"]
         if name == "recorder":
             self.recorder_spoke = monotonic()
+            self.unheard_progress = 0
         node = int(name[5:]) if name.startswith("node ") else -1
         match event:
             case "waiting":
@@ -72,17 +90,33 @@ class RunState:
                     self.ready.add(name)
             case "failed" if name == "live" and self.all_linked:
                 return  # the run does not need it; its end is told
+            case "failed" if name == "recorder" and self.all_linked:
+                self.unrecorded = line["message"]  # the arm does not need it
             case "failed":
                 self.failures.append(line["message"])
+                self.gave_up = self.gave_up or _code_of(line)
+            case "passive":
+                pace = self.plan.run.pace
+                watching_s = 0.0 if pace is None else PASSIVE_TICKS * pace.period_s
+                self.plant_passive = monotonic() + watching_s + PASSIVE_S
+                self.passive_text = line["text"]
             case "progress" if name == "plant":
                 self.ticks = line["tick"]
+                self.unheard_progress += 1
             case "stopped" if name == "plant":
                 self.plant_stop = line
                 self.ticks = line["tick"]
             case "stopped":
                 self.stopped[node] = line
+            case "refused":
+                self.refused[name, line["what"]] = line["count"]
             case "closed":
                 self.closed = line
+
+    @property
+    def passive_s_left(self) -> float:
+        """How long the plant, whose arm is passive, may still take to stop; 0 if it is not."""
+        return max(0.0, (self.plant_passive or 0.0) - monotonic())
 
     @property
     def all_linked(self) -> bool:
@@ -95,6 +129,12 @@ class RunState:
     def unheard(self) -> list[int]:
         """Nodes that live but have not said their last words."""
         return [i for i, h in sorted(self.nodes.items()) if i not in self.stopped and h.alive]
+
+    @property
+    def unexplained(self) -> list[int]:
+        """Nodes forked here that are dead and of which their zygote has yet to say how they ended."""
+        gone = {i for i, h in self.nodes.items() if isinstance(h, Handle) and h.has_ended}
+        return sorted(i for i in gone - self.stopped.keys() if f"node {i}" not in self.ended)
 
     @property
     def dead(self) -> list[int]:
@@ -150,7 +190,11 @@ class RunState:
         if self.failures:
             return self.failures[0]
         dead = [name for name in self.ended if name not in ("recorder", "live")]
-        return f"{dead[0]} {self.ended[dead[0]]}" if dead else None
+        if dead:
+            return f"{dead[0]} {self.ended[dead[0]]}"
+        # Frozen while it watches a passive arm, when the nodes have ended in order: nobody else misses it.
+        overdue = self.plant_passive is not None and not self.passive_s_left
+        return "the plant does not answer" if overdue else None
 
     def verdict(self, *, interrupted: bool) -> tuple[ExitCode, str, int]:
         """What the end of the run means: exit code, message, first tick not done."""
@@ -158,11 +202,16 @@ class RunState:
         if stop is None:
             how = self.ended.get("plant", "does not answer")
             tick = max([self.ticks, *(report["tick"] for report in self.stopped.values())])
-            return ExitCode.SAFETY_STOP, f"safety stop: the plant {how}", tick
+            text = (
+                f"{self.passive_text} (the plant {how})"
+                if self.passive_text
+                else f"the plant {how}"
+            )
+            return ExitCode.SAFETY_STOP, f"safety stop: {text}", tick
         tick, text = int(stop["tick"]), str(stop["text"])
         if stop["cause"] == "finished":
             return ExitCode.OK, "", tick
-        if interrupted:
+        if interrupted and stop["cause"] != "safety":
             return ExitCode.INTERRUPTED, f"interrupted at tick {tick}", tick
         if not text.startswith("tick"):
             text = f"tick {tick}: {text}"
@@ -172,27 +221,58 @@ class RunState:
             for i, report in sorted(self.stopped.items())
             if report["missing"] and f"node {i} waited" not in text
         ]
+        details = [
+            f"{name} {how}"
+            for name, how in self.ended.items()
+            if name not in ("recorder", "live") and f"{name} {how}" not in text
+        ] + details
         more = f" ({'; '.join(details[:SHOWN])})" if details else ""
         return ExitCode.SAFETY_STOP, f"safety stop: {text}{more}", tick
 
     def recording_trouble(self) -> str:
         """What is wrong with the recording of a run that went well otherwise; empty if nothing."""
         where = self.plan.recorder.path
+        if self.unrecorded:
+            return f"{self.unrecorded}: the rest of the run is not recorded"
         if "recorder" in self.ended:
             return f"the recorder {self.ended['recorder']}: {where} can be read up to there"
         if self.closed is None:
             return f"the recorder did not finish: {where} may end early"
-        lost = int(self.closed["ticks_lost"])
-        if lost or self.closed["ticks_recorded"] < self.plan.run.ticks:
-            return f"{where}: records were lost ({lost} node ticks)"
+        cut = int(self.closed["disk_full_at"])
+        if cut >= 0:
+            return f"{where}: the disk was full, the recording ends before tick {cut}"
+        lost, recorded = int(self.closed["ticks_lost"]), int(self.closed["ticks_recorded"])
+        if lost or recorded < self.plan.run.ticks:
+            rest = f", and all from tick {recorded} on" if recorded < self.plan.run.ticks else ""
+            return f"{where}: records were lost ({lost} node ticks{rest})"
         return ""
+
+    @property
+    def refused_peers(self) -> list[dict[str, Any]]:
+        """The same as the recording has it."""
+        return [
+            {"by": name, "what": what, "count": count}
+            for (name, what), count in sorted(self.refused.items())
+        ]
 
     def pace_trouble(self) -> str:
         """What to say of a run that kept going, but not on time; empty if it did."""
         late = int((self.closed or {}).get("late_ticks", 0))
+        bridged = int((self.closed or {}).get("bridged_sums", 0))
+        if not late and bridged and not self.plan.run.restart:
+            return f"{bridged} sums between neighbours did not come in time and were bridged"
         if not late:
             return ""
         return (
             f"{late} of {self.plan.run.ticks} ticks were late, their commands held; for fewer give a longer "
             "--period or --sched fifo"
         )
+
+
+def _code_of(line: dict[str, Any]) -> ExitCode:
+    """What a process that gave up before the first tick means for the launcher's exit code."""
+    if line["code"] == "internal":
+        return ExitCode.INTERNAL
+    code = ExitCode(line.get("exit", ExitCode.START_UP_TIMEOUT))
+    # Nothing internal is meant by an error without a code of its own: something was not to be had.
+    return ExitCode.START_UP_TIMEOUT if code is ExitCode.INTERNAL else code

@@ -18,8 +18,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from design.solve_command import finite
+from analysis.whole_directory import make_directory
 from wire.artefact import read_artefact
+from wire.config_json import finite
 from wire.errors import UsageError
 
 STUDIES = ("robustness", "baselines", "convergence", "growth")
@@ -102,14 +103,7 @@ def _targets(name: str, module: ModuleType, out: Path | None, force: bool) -> tu
             raise UsageError(
                 f"--out {out}: {target.name} exists there already; give another directory or --force"
             )
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=out):
-            pass
-    except OSError as error:
-        raise UsageError(
-            f"--out {out}: {error.strerror or error}; give a directory that can be written"
-        ) from None
+    make_directory(out)
     return targets
 
 

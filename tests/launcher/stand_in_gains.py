@@ -11,6 +11,7 @@ from typing import Any
 
 import msgspec
 from closed_form import artefact
+from threadpoolctl import threadpool_info
 
 from design.arm_file import ArmFile
 from design.command import Job
@@ -58,7 +59,7 @@ def well(
     progress: Callable[[str], None] = lambda _: None,
 ) -> GainDesign:
     name = file.setpoints[index].name
-    threads = os.environ.get("OPENBLAS_NUM_THREADS", "any")
+    threads = max(pool["num_threads"] for pool in threadpool_info())
     progress(f"setpoint {name}, {role}: at work, threads {threads}")
     if role == "controller" and name == "hangs":
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # as native code does

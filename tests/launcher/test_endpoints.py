@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from ports import free_ports
 
 from supervise import endpoints
 from supervise.endpoints import HIGHEST_FREE_PORT, choose
@@ -62,15 +63,22 @@ def test_only_directories_of_dead_runs_are_swept(
     dead, fresh, foreign = (tmp_path / n for n in ("octarm-dead", "octarm-fresh", "other-dead"))
     for directory in (dead, fresh, foreign):
         directory.mkdir()
+    (dead / "plant.lock").touch()
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(str(dead / "plant"))
+    own = tmp_path / "octarm-keys"
+    own.mkdir()
+    (own / "ca.key").touch()  # a user's directory, by chance with a name like those
     running = choose(2, "unix", None, None)
     assert running.private is not None
-    for directory in (dead, foreign, Path(running.private)):
+    for directory in (dead, foreign, own, Path(running.private)):
         os.utime(directory, (1.0, 1.0))
     second = choose(2, "unix", None, None)
     try:
         assert not dead.exists()
         assert fresh.exists()
         assert foreign.exists()
+        assert (own / "ca.key").exists()
         assert Path(running.private).exists()
     finally:
         second.close()
@@ -103,8 +111,8 @@ def test_free_ports_are_free_and_below_the_kernels() -> None:
 
 
 def test_every_port_of_a_base_is_checked() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        taken = server.getsockname()[1]
+    taken = free_ports(5) + 2
+    with socket.create_server(("127.0.0.1", taken)):
         for offset in range(3):
             with pytest.raises(UsageError, match=f"port {taken} "):
                 choose(3, "tcp", taken - offset, None)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING
 import netlab
 import pytest
 from lossy_link import Loss
+from ports import free_ports
 
 from analysis.mcap_file import McapContent, read_mcap
 from analysis.recording import read_recording
@@ -45,11 +45,8 @@ def write_hosts(
 
 
 def free_port(address: str) -> int:
-    """The first of a few ports of a loopback address that nobody holds."""
-    if not address.startswith("127."):
-        return 17_000
-    with socket.create_server((address, 0)) as server:
-        return 10_000 + int(server.getsockname()[1]) % 20_000
+    """The first of two ports of a loopback address that nobody holds."""
+    return free_ports(2, address) if address.startswith("127.") else 17_000
 
 
 def numbers(content: McapContent) -> dict[str, tuple[list[bytes], list[int]]]:
@@ -140,7 +137,7 @@ def test_a_start_command_that_fails_is_named_with_its_last_words(
 ) -> None:
     hosts = write_hosts(tmp_path, "sh -c 'echo no way in >&2; exit 255' ssh")
     cli = start.run("--nodes", "4", "--ticks", "5", "--hosts", hosts)
-    assert cli.finish() == 1
+    assert cli.finish() == 5
     assert "host tip-side exited with code 255 (last said: no way in)" in cli.err
     assert "Traceback" not in cli.err
     nothing_left(cli)
@@ -165,7 +162,7 @@ def test_a_host_that_does_not_answer_is_named(start: Start, tmp_path: Path) -> N
 def test_a_far_node_that_cannot_listen_says_where(start: Start, tmp_path: Path) -> None:
     hosts = write_hosts(tmp_path, "env", far="10.77.255.1")
     cli = start.run("--nodes", "4", "--ticks", "5", "--hosts", hosts)
-    assert cli.finish() == 1
+    assert cli.finish() == 5
     assert "node 2: cannot listen on tcp/10.77.255.1:17000 of " in cli.err
     assert ": Cannot assign requested address; " in cli.err
     assert "Traceback" not in cli.err

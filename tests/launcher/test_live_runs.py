@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -13,11 +14,13 @@ import numpy as np
 import pytest
 from in_process import octarm
 from live_frames import check_frame
-from live_page import address, events
+from live_page import PATIENCE_S, address, events
+from ports import free_ports
 from test_hosts import SSH, write_hosts
 
 from analysis.compare import first_difference
 from analysis.recording import read_recording
+from wire.channels import Health
 
 if TYPE_CHECKING:
     from conftest import Cli, Start
@@ -49,48 +52,91 @@ def nothing_left(cli: Cli, port: int) -> None:
     assert not list(cli.work.glob("**/processes.log"))  # nobody had anything to complain about
 
 
-def test_frames_are_the_recorded_ticks_and_the_end_is_told(start: Start) -> None:
-    nodes, ticks = 5, 150
-    cli = start.run("--nodes", str(nodes), "--ticks", str(ticks), "--initial", "chapter", *SLOWLY)
+def test_frames_are_the_recorded_ticks(start: Start) -> None:
+    """Ten of them, however long they take: the page's process has the cores last."""
+    nodes, enough = 5, 10
+    cli = start.run("--nodes", str(nodes), "--ticks", "1000000", "--initial", "chapter", *SLOWLY)
     port = port_of(cli)
-    told = list(events(port))
-    code = cli.finish()
-    assert code in (0, 3), cli.err  # 3: a busy machine was late
+    told, ticks = [], set()
+    for kind, one in events(port):
+        told.append((kind, one))
+        if kind == "frame" and one["tick"] == one["estimate_tick"]:
+            ticks.add(one["tick"])
+            if len(ticks) == enough:
+                cli.popen.send_signal(signal.SIGINT)
+    assert cli.finish() == 130, cli.err
     nothing_left(cli, port)
     recording = read_recording(cli.recording())
     states = [state for kind, state in told if kind == "state"]
     frames = [frame for kind, frame in told if kind == "frame"]
     assert {state["run_id"] for state in states} == {recording.configuration.run_id}
+    assert [True] * nodes in [state["alive"] for state in states]
+    shown = [frame for frame in frames if frame["tick"] == frame["estimate_tick"]]
+    for frame in shown:
+        check_frame(frame, recording)
+    if frames[0]["tick"] < KEPT_FROM_THE_FIRST:
+        assert all("estimation_error" in frame for frame in shown[1:])
+        begun = recording.table("/sweep/timing").by_tick(("started_wall_ns",), recording.ticks)
+        wall_s = 1e-9 * (begun[:, 0] - begun[0, 0])
+        assert [f["wall_s"] for f in shown[1:]] == pytest.approx(
+            [wall_s[f["tick"]] for f in shown[1:]], abs=1e-4
+        )
+    assert frames[-1]["nodes"]["rejected"] == [0] * nodes
+
+
+KEPT_FROM_THE_FIRST = 50
+"""A frame of an earlier tick was made before the ring of live.process had to drop what came first: it holds
+eight batches of each process, which last 0.15 s or 60 ticks in all."""
+
+
+def test_the_end_of_a_run_is_told_with_its_last_tick(start: Start) -> None:
+    nodes, ticks = 3, 60
+    cli = start.run("--nodes", str(nodes), "--ticks", str(ticks), *SLOWLY, "--by-hand", "1")
+    port = port_of(cli)
+    stream = events(port)
+    told = [next(stream)]  # it is looked at when the run begins
+    node = started_by_hand(start, cli)
+    told += stream
+    code = cli.finish()
+    assert code in (0, 3), cli.err  # 3: a busy machine was late
+    assert node.finish() == 0, node.err
+    nothing_left(cli, port)
+    recording = read_recording(cli.recording())
+    states = [state for kind, state in told if kind == "state"]
+    frames = [frame for kind, frame in told if kind == "frame"]
     assert states[-1]["state"] == "finished"
     assert states[-1]["final"]
     assert told[-1] == ("state", states[-1])
     assert states[-1]["message"] == (
         f"all {ticks} ticks done" if code == 0 else states[-1]["message"]
     )
-    assert [True] * nodes in [state["alive"] for state in states]
-    assert len(frames) >= 10
-    shown = [frame for frame in frames if frame["tick"] == frame["estimate_tick"]]
-    for frame in shown:
-        check_frame(frame, recording)
-    assert all("estimation_error" in frame for frame in shown[1:])
-    assert len({frame["tick"] for frame in shown}) >= 10
     last = frames[-1]
     assert last["tick"] == np.flatnonzero(~recording.late)[-1]
     if last["ticks_seen"] == ticks:
         assert last["late_ticks"] == recording.late.sum()
-    assert last["nodes"]["rejected"] == [0] * nodes
-    # The arm's time and the wall clock's are the same in real time, as far as a busy machine can.
-    assert [f["wall_s"] for f in shown] == pytest.approx([0.02 * f["tick"] for f in shown], abs=1.0)
+
+
+def started_by_hand(start: Start, cli: Cli) -> Cli:
+    """Node 1 of a run that waits for it."""
+    limit = time.monotonic() + PATIENCE_S
+    while not (found := list(cli.work.glob("runs/*/node-1.json"))):
+        assert time.monotonic() < limit
+        time.sleep(0.01)
+    return start.node(str(found[0]))
 
 
 def test_a_run_that_is_watched_has_the_numbers_of_one_that_is_not(start: Start) -> None:
     same = ("--nodes", "4", "--ticks", "400", "--no-plot")
     plain = start.run(*same, "--quiet")
     assert plain.finish() == 0, plain.err
-    live = start.run(*same, "--live", "--quiet")
+    live = start.run(*same, "--live", "--quiet", "--by-hand", "1")
     port = port_of(live)
-    told = list(events(port))
+    stream = events(port)
+    told = [next(stream)]  # it is watched from the first tick on
+    node = started_by_hand(start, live)
+    told += stream
     assert live.finish() == 0, live.err
+    assert node.finish() == 0, node.err
     assert live.err == f"live at http://127.0.0.1:{port}/\n"
     assert told[-1][1]["state"] == "finished"
     assert (
@@ -141,25 +187,29 @@ def frame_after(stream: Any, tick: int) -> dict[str, Any]:
 
 
 def test_a_killed_page_leaves_the_run_alone(start: Start) -> None:
-    cli = start.run("--nodes", "3", "--ticks", "150", *SLOWLY)
+    cli = start.run(*ENDLESS)
     stream = events(port := port_of(cli))
-    frame_after(stream, 1)
+    seen = frame_after(stream, 1)["tick"]
     os.kill(cli.processes()[LIVE], signal.SIGKILL)
     assert not any(kind == "state" and state["final"] for kind, state in stream)
-    assert cli.finish() in (0, 3), cli.err
-    assert "the live page was ended by SIGKILL: the run goes on unseen" in cli.err
+    cli.wait_for("the live page was ended by SIGKILL: the run goes on unseen")
+    cli.wait_for_more()
+    cli.popen.send_signal(signal.SIGINT)
+    assert cli.finish() == 130, cli.err
     assert cli.err.count("live page") == 1
-    assert read_recording(cli.recording()).ticks == 150
+    assert read_recording(cli.recording()).ticks > seen + 10
     nothing_left(cli, port)
 
 
 def test_a_frozen_page_is_not_waited_for(start: Start) -> None:
-    cli = start.run("--nodes", "3", "--ticks", "100", *SLOWLY)
+    cli = start.run(*ENDLESS)
     stream = events(port := port_of(cli))
-    frame_after(stream, 1)
+    seen = frame_after(stream, 1)["tick"]
     os.kill(cli.processes()[LIVE], signal.SIGSTOP)
-    assert cli.finish() in (0, 3), cli.err
-    assert read_recording(cli.recording()).ticks == 100
+    cli.wait_for_more()
+    cli.popen.send_signal(signal.SIGINT)
+    assert cli.finish() == 130, cli.err
+    assert read_recording(cli.recording()).ticks > seen + 10
     nothing_left(cli, port)
 
 
@@ -210,13 +260,14 @@ def test_pages_that_come_and_go_are_served_anew(start: Start) -> None:
     port = port_of(cli)
     first = frame_after(stream := events(port), 10)
     stream.close()  # type: ignore[attr-defined] # a generator: the connection ends
-    time.sleep(2.5)  # noticed at the heartbeat; the process listens no more
+    await_rest(cli)  # noticed at the heartbeat; the process listens no more
     second = frame_after(again := events(port), 0)
-    assert second["tick"] > first["tick"] + 50
+    assert second["tick"] > first["tick"] + 30  # a second's, less what a frame may be behind
     assert second["estimate_tick"] == second["tick"]
     third = frame_after(again, second["tick"] + 30)
     assert third["ticks_seen"] < third["tick"]  # nobody has looked in between
-    assert all(third["nodes"]["on_time"])
+    while not all(third["nodes"]["on_time"]):  # on a busy machine a tick may be late at any time
+        third = frame_after(again, third["tick"] + 1)
     cli.popen.send_signal(signal.SIGINT)
     assert cli.finish() == 130
 
@@ -230,35 +281,46 @@ def test_links_to_another_host_are_not_measured_with_two_clocks(
     for way in ("forward", "backward"):
         known = [us is not None for us in frame["links"][f"{way}_us"]]
         assert known == [True, False, False]
-    assert frame["nodes"]["late"][2:] == [0, 0]
     cli.popen.send_signal(signal.SIGINT)
     assert cli.finish() == 130
     assert cli.gone() == {}
     assert refused(port)
+    health = read_recording(cli.recording()).health
+    late = np.count_nonzero(~health & int(Health.ON_TIME), axis=0)  # none, on a machine with time
+    assert (np.array(frame["nodes"]["late"]) <= late).all()
 
 
-def wake_ups(pid: int) -> dict[str, int]:
-    """How often each thread has waited for something, but for Zenoh's, which keeps the link alive."""
+def wake_ups(pid: int) -> dict[str, tuple[int, bool]]:
+    """How often each thread has waited for something, and whether it waits now; but for Zenoh's, which keeps
+    the link alive."""
     found = {}
     for task in Path(f"/proc/{pid}/task").iterdir():
-        if (task / "comm").read_text().strip() == LIVE:
-            status = (task / "status").read_text()
-            found[task.name] = int(status.partition("voluntary_ctxt_switches:")[2].split()[0])
+        with contextlib.suppress(FileNotFoundError):  # the thread of a page that has gone
+            if (task / "comm").read_text().strip() == LIVE:
+                status = (task / "status").read_text()
+                count = int(status.partition("voluntary_ctxt_switches:")[2].split()[0])
+                found[task.name] = count, "State:\tS" in status
     return found
+
+
+def await_rest(cli: Cli) -> dict[str, tuple[int, bool]]:
+    """Wait until the page's process has waited for a whole second; its wake-ups."""
+    pid = cli.processes()[LIVE]
+    limit = time.monotonic() + PATIENCE_S
+    while True:
+        before = wake_ups(pid)
+        time.sleep(1.0)
+        if wake_ups(pid) == before and all(waits for _, waits in before.values()):
+            return before
+        assert time.monotonic() < limit, "it is always at work"
 
 
 def test_while_nobody_watches_nothing_is_done(start: Start) -> None:
     cli = start.run(*ENDLESS)
     port = port_of(cli)
-    time.sleep(3.0)  # it has had everybody's first tick, or has given it up
-    pid = cli.processes()[LIVE]
-    before = wake_ups(pid)
-    time.sleep(1.0)
-    assert wake_ups(pid) == before
-    stream = events(port)
-    frame_after(stream, 0)
-    time.sleep(0.5)
-    assert wake_ups(pid) != before
+    before = await_rest(cli)  # it has had everybody's first tick, or has given it up
+    frame_after(events(port), 0)
+    assert wake_ups(cli.processes()[LIVE]) != before
     cli.popen.send_signal(signal.SIGINT)
     assert cli.finish() == 130
 
@@ -279,8 +341,7 @@ def test_the_page_steps_back_behind_everything(start: Start) -> None:
 
 
 def test_a_port_that_is_asked_for_is_used(start: Start) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
+    port = free_ports()
     cli = start.run(
         "--nodes", "3", "--ticks", "20", "--no-plot", "--live", "--live-port", str(port)
     )

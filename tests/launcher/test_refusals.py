@@ -27,6 +27,7 @@ WRONG = {
     "zero ticks": (["--ticks", "0"], 2, "--ticks"),
     "negative tick": (["--tick", "-0.1"], 2, "--tick"),
     "tick not a number": (["--tick", "nan"], 2, "--tick"),
+    "tick of less than 1 ns": (["--tick", "5e-324"], 2, "--tick"),
     "tick too long": (["--tick", "1"], 2, "longest stable tick"),
     "negative seed": (["--seed", "-1"], 2, "--seed"),
     "unknown setpoint": (["--setpoint", "7"], 2, "straight, 1"),
