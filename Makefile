@@ -5,12 +5,16 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 TEST_STAMP := $(VENV)/.installed-test
 
-.PHONY: run test lint clean
+.PHONY: run test test-all lint clean
 run: $(STAMP)
 	$(BIN)/octarm run
 
 test: $(TEST_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+# With every variant of the tests that inject faults into real processes: some ten minutes more.
+test-all: $(TEST_STAMP)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --every
 
 lint: $(TEST_STAMP)
 	$(BIN)/ruff check .
@@ -27,6 +31,8 @@ $(STAMP): pyproject.toml constraints.txt
 
 $(TEST_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test]"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: -c constraints.txt -e ".[baselines]" \
+		|| echo "no wheels of python-control and slycot here: the tests that compare with them are left out"
 	@touch $(TEST_STAMP)
 
 clean:

@@ -20,7 +20,8 @@ from bench.results import FORMAT, read_results, write_results
 from bench.statistics import ratios, targets
 from bench.table import table
 from supervise.origin import machine_facts, versions
-from wire.errors import ExitCode, OctarmError, UsageError
+from supervise.own_directory import claim, tidy
+from wire.errors import ExitCode, OctarmError
 
 RESULTS = "bench.json"
 PICTURE = "bench.png"
@@ -47,11 +48,11 @@ def run_bench(options: BenchOptions, progress: Callable[[str], None]) -> Bench:
     """
     old = None if options.compare is None else read_results(options.compare)
     date = time.strftime("%Y-%m-%dT%H:%M:%S%z")
-    directory, made = _directory(options.out)
-    log_path = directory / LOG
+    directory = options.out or Path("runs") / time.strftime("bench-%Y%m%d-%H%M%S")
+    made = claim(directory, LOG)
     ended: BaseException | None = None
     try:
-        with log_path.open("wb") as log, Signals() as signals:
+        with (directory / LOG).open("wb") as log, Signals() as signals:
             campaign = Campaign(options, log, signals, progress)
             try:
                 campaign.run()
@@ -66,7 +67,7 @@ def run_bench(options: BenchOptions, progress: Callable[[str], None]) -> Bench:
         if ended is not None and not isinstance(ended, KeyboardInterrupt | OctarmError):
             raise ended
     finally:
-        _tidy(directory, made, log_path)
+        tidy(directory, LOG, made=made)
     code, message = _ending(ended)
     return Bench(facts, table(facts), files, code, message)
 
@@ -106,32 +107,3 @@ def _ending(error: BaseException | None) -> tuple[ExitCode, str]:
     if isinstance(error, KeyboardInterrupt):
         return ExitCode.INTERRUPTED, "interrupted"
     return ExitCode.INTERNAL, f"internal error: {error!r}"
-
-
-def _directory(out: Path | None) -> tuple[Path, bool]:
-    """The benchmark's own directory, and whether it was made here; nothing is ever written over."""
-    directory = out or Path("runs") / time.strftime("bench-%Y%m%d-%H%M%S")
-    try:
-        made = not directory.exists()
-        directory.mkdir(parents=True, exist_ok=True)
-        occupied = next((file.name for file in directory.iterdir()), None)
-        if occupied is None:
-            (directory / LOG).touch(exist_ok=False)
-    except OSError as error:
-        raise UsageError(
-            f"--out {directory}: {error.strerror or error}; give a directory that can be written"
-        ) from None
-    if occupied is not None:
-        raise UsageError(
-            f"--out {directory}: there is something in it already ({occupied}); nothing is written "
-            "over, give another directory"
-        )
-    return directory, made
-
-
-def _tidy(directory: Path, made: bool, log: Path) -> None:
-    """Leave no empty log, and no empty directory that was made here."""
-    if log.exists() and log.stat().st_size == 0:
-        log.unlink()
-    if made and directory.exists() and not any(directory.iterdir()):
-        directory.rmdir()

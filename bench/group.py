@@ -26,8 +26,8 @@ from bench.real_nodes import RealNodes
 from supervise.children import Handle, Process, ending, module
 from supervise.endpoints import Endpoints, choose
 from wire.child import Deadline
+from wire.config_json import dumps
 from wire.errors import OctarmError, StartUpTimeoutError
-from wire.run_config import dumps
 
 START_S = 60.0
 WARM_TICKS = 50

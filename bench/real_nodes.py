@@ -13,12 +13,12 @@ from pathlib import Path
 from bench.configs import PATIENCE_S, EndRows, Port
 from node.row import Y
 from supervise.endpoints import Endpoints
-from supervise.options import MOST_TICKS, RunOptions
+from supervise.options import RunOptions
 from supervise.plan import Prepared, make_plan, prepare
-from wire.channels import SUMS_AT
+from wire.channels import DEGRADED, SUMS_AT
 from wire.factors import NodeFactors
 from wire.messages import message_bytes
-from wire.run_config import NodeConfig
+from wire.run_config import MOST_TICKS, NodeConfig
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,8 @@ def deploy_nodes(gains: Path, nodes: int, per_process: int = 1) -> RealNodes:
             _row(factors[-1]),
             groups[-1][0],
             tip=nodes - 1,
-            measured=-3,
-            arrived=-2,
+            measured=-3 - len(DEGRADED),
+            arrived=-2 - len(DEGRADED),
         ),
         payload_bytes=round(sum(sums) / len(sums)),
         command_bytes=message_bytes(per_process),
@@ -76,8 +76,8 @@ def deploy_nodes(gains: Path, nodes: int, per_process: int = 1) -> RealNodes:
 
 
 def _row(factors: NodeFactors) -> int:
-    """Columns of an end node's telemetry row: its numbers, the sums, and three instants."""
-    return SUMS_AT + factors.forward_received + factors.backward_received + 3
+    """Columns of an end node's telemetry row: its numbers, the sums, three instants, and how the tick went."""
+    return SUMS_AT + factors.forward_received + factors.backward_received + 3 + len(DEGRADED)
 
 
 def node_configs(

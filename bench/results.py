@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from wire.errors import UsageError
+from wire.files import DATA_BYTES, read_limited
 
 FORMAT = "octarm-bench-1"
 
@@ -42,10 +43,10 @@ def read_results(path: Path) -> dict[str, Any]:
     if path.is_dir():
         path /= "bench.json"
     try:
-        facts = json.loads(path.read_text())
+        facts = json.loads(read_limited(path, DATA_BYTES))
     except OSError as error:
         raise UsageError(f"--compare {path}: {error.strerror or error}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise UsageError(f"--compare {path}: not JSON ({error}); give a bench.json") from None
     if not isinstance(facts, dict) or facts.get("format") != FORMAT:
         raise UsageError(f'--compare {path}: expected a file with "format": "{FORMAT}"')

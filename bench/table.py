@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from analysis.text_table import aligned, ruled
+
 SWEEP = (
     "n",
     "pattern",
@@ -121,15 +123,6 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _aligned(head: Sequence[str], body: Sequence[Sequence[str]]) -> list[str]:
-    """Columns as wide as their longest entry: words to the left, numbers to the right."""
-    widths = [max(map(len, column)) for column in zip(head, *body, strict=True)]
-    words = ("pattern", "target", "")
-
-    def line(row: Sequence[str]) -> str:
-        cells = zip(row, head, widths, strict=True)
-        return "  ".join(
-            cell.ljust(width) if name in words else cell.rjust(width) for cell, name, width in cells
-        ).rstrip()
-
-    shown = line(head)
-    return [shown, "─" * max(len(shown), *map(len, map(line, body)), 1), *map(line, body)]
+    """Words to the left, numbers to the right."""
+    words = [place for place, name in enumerate(head) if name in ("pattern", "target", "")]
+    return ruled(aligned(head, body, left=words))

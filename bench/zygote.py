@@ -10,9 +10,8 @@ from bench.configs import WorkerConfig
 from bench.raw import run_raw
 from bench.worker import Worker
 from wire.child import Child, die_with_parent, name_process
-from wire.errors import ExitCode, OctarmError
+from wire.errors import ExitCode
 from wire.forking import Nursery, life
-from wire.run_config import loads
 
 
 def serve(parent: int, directory: str | None) -> int:
@@ -24,20 +23,11 @@ def serve(parent: int, directory: str | None) -> int:
     while not child.stopping:
         for line in child.wait_lines(None):
             if not child.stopping:
-                _birth(line, child, nursery)
+                nursery.birth(line, WorkerConfig, "worker configuration", _run_worker)
         nursery.reap()
     nursery.end()
     child.leave([])
     return 0
-
-
-def _birth(line: bytes, child: Child, nursery: Nursery) -> None:
-    try:
-        config = loads(WorkerConfig, line, "worker configuration")
-    except OctarmError as error:
-        child.status("failed", code="configuration", message=str(error))
-        return
-    nursery.fork(config.index, lambda own: _run_worker(config, own))
 
 
 def _run_worker(config: WorkerConfig, parent: int) -> int:

@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -135,16 +135,35 @@ def measure(
     cases: Sequence[str], ways: dict[str, tuple[bool, list[list[str]]]], rounds: int
 ) -> dict[str, dict[str, list[Figures]]]:
     """Figures of every round by case and way."""
+
+    def run(case: str, way: str) -> Figures:
+        live, watchers = ways[way]
+        figures = run_once(CASES[case], live=live, watchers=watchers)
+        time.sleep(0.5)
+        return figures
+
+    return in_turn(cases, list(ways), rounds, run)
+
+
+def in_turn(
+    cases: Sequence[str], ways: Sequence[str], rounds: int, run: Callable[[str, str], Figures]
+) -> dict[str, dict[str, list[Figures]]]:
+    """Figures of every round by case and way; every round runs each way once, in another order."""
     order = random.Random(1)
     found: dict[str, dict[str, list[Figures]]] = {c: {way: [] for way in ways} for c in cases}
     for number in range(rounds):
         for case in cases:
-            for way in order.sample(list(ways), len(ways)):
-                live, watchers = ways[way]
-                found[case][way].append(run_once(CASES[case], live=live, watchers=watchers))
+            for way in order.sample(ways, len(ways)):
+                found[case][way].append(run(case, way))
                 print(f"round {number + 1}, {case}, {way}: {found[case][way][-1]}", file=sys.stderr)
-                time.sleep(0.5)
     return found
+
+
+def medians(runs: Sequence[Figures]) -> list[float]:
+    """Of each figure over the rounds, in the order of `Figures`."""
+    return [
+        statistics.median(getattr(run, field.name) for run in runs) for field in fields(Figures)
+    ]
 
 
 def table(found: dict[str, dict[str, list[Figures]]]) -> str:
@@ -155,10 +174,7 @@ def table(found: dict[str, dict[str, list[Figures]]]) -> str:
     ]
     for case, ways in found.items():
         for way, runs in ways.items():
-            p50, p99, rate, late = (
-                statistics.median(getattr(run, field.name) for run in runs)
-                for field in fields(Figures)
-            )
+            p50, p99, rate, late = medians(runs)
             figures = f"{p50:.3g} ms | {p99:.3g} ms | {rate:.4g} | {late:g}"
             lines.append(f"| {case} | {way} | {figures} |")
     return "\n".join(lines)

@@ -9,6 +9,7 @@ from random import Random
 from types import SimpleNamespace
 
 import pytest
+import zenoh
 
 
 @dataclass
@@ -37,6 +38,9 @@ class Bus:
     subscribers: dict[str, list[Callable[[bytes], None]]] = field(
         default_factory=lambda: defaultdict(list)
     )
+    watchers: dict[str, list[Callable[[object], None]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
     sent: list[tuple[str, bytes]] = field(default_factory=list)
     waiting: list[tuple[str, bytes]] = field(default_factory=list)
 
@@ -47,6 +51,19 @@ class Bus:
 
     def declare_publisher(self, key: str, **_how: object) -> Publisher:
         return Publisher(self, key)
+
+    def liveliness(self) -> SimpleNamespace:
+        """Everybody is there, until `vanish`."""
+
+        def watch(key: str, handler: Callable[[object], None], **_how: object) -> None:
+            self.watchers[key].append(handler)
+
+        return SimpleNamespace(declare_subscriber=watch)
+
+    def vanish(self, key: str) -> None:
+        """Tell those who watch it that the token of this key is gone."""
+        for watcher in self.watchers[key]:
+            watcher(SimpleNamespace(kind=zenoh.SampleKind.DELETE))
 
     def declare_subscriber(self, key: str, handler: Callable[[bytes], None]) -> None:
         self.subscribers[key].append(handler)

@@ -13,16 +13,24 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 from closed_form import write_gains
+from hypothesis import settings
+
+from analysis.recording import Recording, read_recording
+from chaos.aftermath import Expected, Remains, violations
+from chaos.processes import end_all, living, marked
+from chaos.trial import BEGUN
 
 ROOT = Path(__file__).resolve().parents[1]
-MARK = "OCTARM_TEST_RUN"
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
+"""Longer than anything that is waited for takes on a machine that is ten times busier than it should be."""
+# `pytest tests/fuzz --hypothesis-profile=deep`: many examples, other ones in every run (docs/fuzzing.md)
+settings.register_profile("deep", max_examples=20_000, deadline=None, print_blob=True)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Started in the background of a shell: what the tests start would not hear Ctrl-C either.
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -42,7 +50,7 @@ class Cli:
         self.mark = secrets.token_hex(8)
         self.work = work
         self.sockets = Path(tempfile.mkdtemp(prefix="ot-"))
-        environment = {**os.environ, MARK: self.mark, "TMPDIR": str(self.sockets)}
+        environment = {**os.environ, **marked(self.mark), "TMPDIR": str(self.sockets)}
         environment.pop("COLUMNS", None)
         source = subprocess.DEVNULL if stdin is None else stdin.open("rb")
         self.popen = subprocess.Popen(
@@ -60,33 +68,30 @@ class Cli:
 
     def processes(self) -> dict[str, int]:
         """Name and number of every living process with this run's mark."""
-        found: dict[str, int] = {}
-        wanted = f"{MARK}={self.mark}".encode()
-        for directory in Path("/proc").iterdir():
-            if not directory.name.isdigit():
-                continue
-            with contextlib.suppress(OSError):
-                if wanted not in (directory / "environ").read_bytes().split(b"\0"):
-                    continue
-                state = (directory / "stat").read_text().rpartition(")")[2].split()[0]
-                if state not in "ZX":
-                    name = (directory / "comm").read_text().strip()
-                    name = "launcher" if int(directory.name) == self.popen.pid else name
-                    found[name] = int(directory.name)
-        return found
+        launcher = self.popen.pid
+        return {"launcher" if p.pid == launcher else p.name: p.pid for p in living(self.mark)}
 
-    def wait_for(self, text: str) -> None:
-        """Read standard error until a line begins with the text."""
+    def wait_for(self, text: str, times: int = 1) -> None:
+        """Read standard error until so many lines begin with the text."""
+        self._read_until(
+            lambda: sum(line.startswith(text) for line in self.err.splitlines()) >= times, text
+        )
+
+    def wait_for_links(self) -> None:
+        """Wait for the word that everybody is linked, which comes just before the first tick."""
+        self._read_until(lambda: f"{BEGUN} " in self.err, BEGUN)
+
+    def _read_until(self, true: Callable[[], bool], what: str) -> None:
         assert self.popen.stderr is not None
         descriptor = self.popen.stderr.fileno()
         limit = time.monotonic() + PATIENCE_S
         with selectors.DefaultSelector() as selector:
             selector.register(descriptor, selectors.EVENT_READ)
-            while not any(line.startswith(text) for line in self.err.splitlines()):
-                assert time.monotonic() < limit, f"no line {text!r} in:\n{self.err}"
+            while not true():
+                assert time.monotonic() < limit, f"no line {what!r} in:\n{self.err}"
                 if selector.select(1.0):
                     data = os.read(descriptor, 65536)
-                    assert data, f"ended without a line {text!r}:\n{self.err}"
+                    assert data, f"ended without a line {what!r}:\n{self.err}"
                     self.err += data.decode()
 
     def wait_for_records(self) -> None:
@@ -102,6 +107,10 @@ class Cli:
             time.sleep(0.02)
         self._wait_for_writes(2)
 
+    def wait_for_more(self) -> None:
+        """Wait until the recorder has written twice more."""
+        self._wait_for_writes(2)
+
     def _wait_for_writes(self, times: int) -> None:
         limit = time.monotonic() + PATIENCE_S
         for _ in range(times):
@@ -110,9 +119,9 @@ class Cli:
                 assert time.monotonic() < limit, "the recorder writes nothing"
                 time.sleep(0.02)
 
-    def finish(self) -> int:
+    def finish(self, patience_s: float = PATIENCE_S) -> int:
         """Wait for the end; returns the exit code."""
-        out, err = self.popen.communicate(timeout=PATIENCE_S)
+        out, err = self.popen.communicate(timeout=patience_s)
         self.out += (out or b"").decode()
         self.err += err.decode()
         return self.popen.returncode
@@ -135,10 +144,23 @@ class Cli:
                 self.popen.wait(0.05)
         return left
 
+    def remains(self) -> Remains:
+        """What the run left, for the check after a fault (chaos.aftermath)."""
+        code = self.popen.returncode
+        return Remains(self.mark, self.sockets, self.work, code, self.out, self.err)
+
+    def ends(self, expected: Expected) -> None:
+        """Wait for the end and check everything that must be true after it."""
+        self.finish()
+        wrong = violations(self.remains(), expected)
+        assert not wrong, "\n".join([*wrong, "standard error:", self.err])
+
+    def recorded(self) -> Recording:
+        """The recording, read."""
+        return read_recording(self.recording())
+
     def close(self) -> None:
-        for pid in self.processes().values():
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+        end_all(self.mark)
         self.popen.wait(10)
         for pipe in (self.popen.stdout, self.popen.stderr):
             if pipe is not None:
@@ -181,6 +203,36 @@ def one_run(work: Path, gains: Path, *arguments: str) -> Iterator[Path]:
         yield cli.recording()
     finally:
         cli.close()
+
+
+FAULTS = ("faults", "security")
+"""Folders whose tests take seconds of real time each, many of them for every node, flow and way."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--every",
+        action="store_true",
+        help="every variant of the tests in tests/faults and tests/security, not one of each",
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Of a fault that is tried in many variants take one, always the same, unless `--every` is given."""
+    if config.getoption("--every"):
+        return
+    variants: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        if item.path.parent.name in FAULTS:
+            variants.setdefault(item.nodeid.partition("[")[0], []).append(item)
+    left_out = {
+        id(item)
+        for several in variants.values()
+        for item in sorted(several, key=lambda one: one.nodeid)[1:]
+    }
+    if left_out:
+        config.hook.pytest_deselected(items=[item for item in items if id(item) in left_out])
+        items[:] = [item for item in items if id(item) not in left_out]
 
 
 @pytest.fixture(scope="session")

@@ -12,8 +12,8 @@ import launcher
 
 
 def octarm(*arguments: str | Path) -> object:
-    """The exit code of `octarm` with these arguments; the test's own handler of SIGTERM is put back."""
-    before = signal.getsignal(signal.SIGTERM)
+    """The exit code of `octarm` with these arguments; the test's own handlers of signals are put back."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with (
             mock.patch("sys.argv", ["octarm", *map(str, arguments)]),
@@ -21,5 +21,6 @@ def octarm(*arguments: str | Path) -> object:
         ):
             launcher.main()
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return end.value.code

@@ -74,5 +74,5 @@ def test_every_file_that_the_readme_names_is_there() -> None:
 
 def test_every_room_of_the_readme_is_a_package() -> None:
     rooms = re.findall(r"^\| `(\w+)/` \|", README, re.MULTILINE)
-    assert len(rooms) == 10
+    assert len(rooms) == 12
     assert all((ROOT / room / "__init__.py").exists() for room in rooms)

@@ -10,10 +10,11 @@ from bench.configs import PATTERNS, DriverConfig, WorkerConfig
 from bench.layout import Layout, Placement, endpoints_needed, lay_out
 from bench.real_nodes import RealNodes, deploy_nodes
 from supervise.endpoints import Endpoints
+from wire.config_json import dumps, loads
 from wire.errors import UsageError
 from wire.factors import NodeFactors
 from wire.messages import Kind, encode_numbers
-from wire.run_config import LinkConfig, NodeConfig, dumps, loads
+from wire.run_config import LinkConfig, NodeConfig
 
 NODES = 4
 
