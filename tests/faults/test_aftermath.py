@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from conftest import Cli, Start
 
-from chaos.aftermath import LOG, Expected, Remains, violations
+from chaos.aftermath import LOG, Expected, Remains, complaints, violations
 from chaos.processes import marked
 
 
@@ -97,6 +97,28 @@ def test_a_traceback_in_the_log_of_the_processes_is_told(ended: Cli) -> None:
     log.write_text("Traceback (most recent call last):\n")
     _only(ended.remains(), Expected(), "processes.log has a 'Traceback")
     assert violations(ended.remains(), Expected(traceback=True)) == []
+    log.unlink()
+
+
+PANIC = """
+thread 'app-2' (8443) panicked at /build/zenoh/src/net/routing/dispatcher/{place}:
+called `Option::unwrap()` on a `None` value
+stack backtrace:
+   0: __rustc::rust_begin_unwind
+             at /rustc/library/std/src/panicking.rs:1:2
+  13: zenoh_transport::unicast::read_messages::<zenoh_buffers::zslice::ZSlice>
+note: Some details are omitted, run with `RUST_BACKTRACE=full` for a verbose backtrace.
+"""
+
+
+def test_one_panic_of_zenoh_is_known_and_no_other(ended: Cli) -> None:
+    log = ended.recording().with_name(LOG)
+    known = PANIC.format(place="resource.rs:486:27")
+    log.write_text(known + "welcome\n" + known)
+    assert violations(ended.remains(), Expected()) == []
+    assert complaints(ended.work) == "welcome\n"
+    log.write_text(known + PANIC.format(place="resource.rs:487:27") + known)
+    _only(ended.remains(), Expected(), "processes.log has a 'panicked at'")
     log.unlink()
 
 
