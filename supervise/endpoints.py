@@ -11,7 +11,6 @@ import contextlib
 import errno
 import fcntl
 import os
-import random
 import secrets
 import shutil
 import socket
@@ -26,6 +25,7 @@ from wire.errors import UsageError
 
 LONGEST_SOCKET_PATH = 107
 """Bytes of a unix socket's path on Linux, without the closing zero."""
+LOWEST_FREE_PORT = 10_000
 HIGHEST_FREE_PORT = 32_768
 """From here on the kernel hands ports to outgoing connections."""
 LOOPBACK = "127.0.0.1"
@@ -236,9 +236,12 @@ def check_live_port(port: int | None) -> None:
 
 
 def _free_base(count: int, address: str = LOOPBACK) -> int | None:
-    """The first of so many free ports in a row, None if none were found."""
+    """The first of so many free ports in a row, None if none were found.
+
+    Not from `random`: two programs that seed it alike, side by side, would choose the same ports.
+    """
     for _ in range(100):
-        base = random.randrange(10_000, HIGHEST_FREE_PORT - count)
+        base = LOWEST_FREE_PORT + secrets.randbelow(HIGHEST_FREE_PORT - count - LOWEST_FREE_PORT)
         if not any(port_taken(port, address) for port in range(base, base + count)):
             return base
     return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import socket
 import stat
 import tempfile
@@ -108,6 +109,14 @@ def test_free_ports_are_free_and_below_the_kernels() -> None:
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(("127.0.0.1", number))
+
+
+def test_programs_that_seed_alike_choose_different_ports() -> None:
+    chosen = []
+    for _ in range(2):
+        random.seed(1)
+        chosen.append([free_ports(4) for _ in range(3)])
+    assert chosen[0] != chosen[1]
 
 
 def test_every_port_of_a_base_is_checked() -> None:

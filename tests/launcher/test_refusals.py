@@ -146,14 +146,6 @@ def test_damaged_gains(start: Start, tmp_path: Path) -> None:
         refused(start("run", "--gains", path), 6, path.name)
 
 
-def test_occupied_port(start: Start) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = int(server.getsockname()[1])
-        base = max(1024, port - 2)
-        cli = start.run("--nodes", "4", "--transport", "tcp", "--base-port", str(base))
-        refused(cli, 2, f"port {port}")
-
-
 def test_occupied_socket_directory(start: Start, tmp_path: Path) -> None:
     used = tmp_path / "s"
     used.mkdir()
