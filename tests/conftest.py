@@ -213,23 +213,39 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--every",
         action="store_true",
-        help="every variant of the tests in tests/faults and tests/security, not one of each",
+        help="every test and every variant, also of those that need much time (tests/conftest.py)",
     )
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    for line in (
+        "every: what others show as well, and slow: left out unless --every is given",
+        "variants(*ids): without --every these parameters only",
+    ):
+        config.addinivalue_line("markers", line)
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Of a fault that is tried in many variants take one, always the same, unless `--every` is given."""
-    if config.getoption("--every"):
+    """Leave out what is for `--every`: always the same tests, so that a day is like the other.
+
+    Of a test in `FAULTS` one variant stays unless it is marked; of one that is marked, those that it names. A
+    variant that is asked for by its own name is not left out.
+    """
+    if config.getoption("--every") or any("[" in argument for argument in config.args):
         return
-    variants: dict[str, list[pytest.Item]] = {}
+    several: dict[str, list[pytest.Item]] = {}
     for item in items:
-        if item.path.parent.name in FAULTS:
-            variants.setdefault(item.nodeid.partition("[")[0], []).append(item)
-    left_out = {
-        id(item)
-        for several in variants.values()
-        for item in sorted(several, key=lambda one: one.nodeid)[1:]
-    }
+        several.setdefault(item.nodeid.partition("[")[0], []).append(item)
+    left_out = {id(item) for item in items if item.get_closest_marker("every")}
+    for variants in several.values():
+        variants.sort(key=lambda one: one.nodeid)
+        kept = variants
+        if marker := variants[0].get_closest_marker("variants"):
+            # if there is none with such a name, all: a slip must not make a test vanish
+            kept = [one for one in variants if one.callspec.id in marker.args] or variants  # type: ignore[attr-defined]
+        elif variants[0].path.parent.name in FAULTS:
+            kept = variants[:1]
+        left_out |= {id(one) for one in variants if one not in kept}
     if left_out:
         config.hook.pytest_deselected(items=[item for item in items if id(item) in left_out])
         items[:] = [item for item in items if id(item) not in left_out]

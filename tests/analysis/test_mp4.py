@@ -234,6 +234,7 @@ def test_nothing_is_left_of_a_film_whose_picture_failed(path: Path, tmp_path: Pa
     assert children("ffmpeg") == []
 
 
+@pytest.mark.variants("9")
 @needs_ffmpeg
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_ffmpeg_ends_with_the_verb(

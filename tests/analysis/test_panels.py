@@ -429,6 +429,7 @@ def odd(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Recording]:
     return get
 
 
+@pytest.mark.variants("one tick", "every other tick late", "recorder killed")
 @pytest.mark.parametrize("kind", ODD)
 def test_every_panel_draws_every_odd_recording(
     odd: Callable[[str], Recording], kind: str, tmp_path: Path

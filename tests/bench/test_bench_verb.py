@@ -65,6 +65,7 @@ def test_every_pattern_counts_its_messages_at_the_receivers(start: Start) -> Non
     assert all(t["met"] for t in facts["targets"])
 
 
+@pytest.mark.every
 def test_compared_with_itself_every_ratio_is_one(start: Start, tmp_path: Path) -> None:
     chosen = ["--nodes", "3", "--pattern", "bare", "--pattern", "raw", "--no-rates", *SHORT]
     first = start("bench", "--gains", start.gains, *chosen, "--out", tmp_path / "old")
@@ -98,6 +99,7 @@ def interrupt_during(start: Start, number: signal.Signals) -> Cli:
     return cli
 
 
+@pytest.mark.variants("2")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interruption_keeps_what_is_finished_and_leaves_nothing(
     start: Start, number: signal.Signals

@@ -97,6 +97,7 @@ def test_an_unexplained_stop_is_found(tmp_path: Path, monkeypatch: pytest.Monkey
     assert "exit code 4, expected 0 or 3" in wrong
 
 
+@pytest.mark.variants("kill node-", "freeze live+kill zygote-", "pause plant-")
 @pytest.mark.parametrize(
     ("faults", "code"),
     [
@@ -117,6 +118,9 @@ def test_endless_runs_end_as_is_decided(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.variants(
+    "gains-flipped", "scenario-truncated", "hosts-noise", "place-port", "keys-foreign"
+)
 @pytest.mark.parametrize(
     ("kind", "variant"), [(kind, one) for kind, many in PREPARED.items() for one in many]
 )

@@ -144,6 +144,7 @@ def test_limits_loads_and_strangers_come(running: tuple[Cli, Scene, Later]) -> N
     assert cli.processes() == before
 
 
+@pytest.mark.variants("mutated")
 @pytest.mark.parametrize("variant", ["mutated", "replayed", "nan"])
 def test_garbage_is_sent_and_refused(start: Start, variant: str) -> None:
     cli = start.run(*ENDLESS)

@@ -77,6 +77,7 @@ def test_ctrl_c_ends_it_with_what_it_has(start: Start) -> None:
     _nothing_left(cli, family)
 
 
+@pytest.mark.variants("campaign")
 @pytest.mark.parametrize("whom", ["campaign", "worker"])
 def test_what_is_killed_takes_its_runs_along(start: Start, whom: str) -> None:
     cli = start("chaos", "--seed", "22", "--minutes", "5", "--quiet")

@@ -270,5 +270,6 @@ def test_a_replacement_that_dies_at_once_is_replaced_as_well(start: Start) -> No
     )
 
 
+@pytest.mark.every
 def test_with_a_live_page(start: Start) -> None:
     replaced(start, 2, arguments=("--live", *REALTIME), ticks=120)

@@ -138,6 +138,7 @@ def test_a_slow_node_makes_ticks_late_and_nothing_else(
     assert np.nanmax(estimates_apart(found, alone)[-5:]) < 0.1
 
 
+@pytest.mark.every
 def test_two_stopped_at_once(start: Start) -> None:
     cli = start.run(*REALTIME, "--ticks", "100000")
     cli.wait_for_records()
@@ -156,6 +157,7 @@ def test_two_stuck_at_once_are_replaced(start: Start) -> None:
     cli.ends(Expected((3,), (r"node_back: node 1", r"node_back: node 2"), said))
 
 
+@pytest.mark.every
 def test_of_several_segments_a_process(start: Start) -> None:
     cli = start.run(*REALTIME, "--ticks", "150", "--restart", "--segments-per-process", "2")
     cli.wait_for_records()

@@ -113,6 +113,7 @@ def test_steps_of_the_wall_clock_hold_no_tick_up(start: Start, clock: Clock) -> 
     assert np.diff(np.flatnonzero(~recording.late)).max() < 25  # half a second, on a busy machine
 
 
+@pytest.mark.every
 def test_a_run_that_starts_an_hour_late_is_the_same(start: Start, clock: Clock) -> None:
     """What the processes were told of the time before and after they were started does not agree."""
     cli = start.run("--nodes", "4", "--ticks", "100", "--by-hand", "3", within=clock.within)

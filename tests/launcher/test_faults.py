@@ -33,6 +33,7 @@ def test_interrupt_keeps_the_recording(start: Start, number: signal.Signals) -> 
     assert event_lines(cli.recorded())[-1].startswith("interrupted: ")
 
 
+@pytest.mark.variants("1")
 @pytest.mark.parametrize("node", [0, 1, 3])
 def test_killed_node_stops_the_arm(start: Start, node: int) -> None:
     cli = start.run(*ENDLESS)
@@ -133,6 +134,7 @@ def waited_s(pid: int) -> float:
     return sum(int(task.read_text().split()[1]) for task in tasks) * 1e-9
 
 
+@pytest.mark.every
 def test_frozen_node_is_named_within_the_deadline(start: Start) -> None:
     cli = start.run(*ENDLESS, "--deadline", "3")
     cli.wait_for("tick ")

@@ -169,6 +169,7 @@ def test_a_far_node_that_cannot_listen_says_where(start: Start, tmp_path: Path) 
     nothing_left(cli)
 
 
+@pytest.mark.every
 def test_nodes_of_a_host_can_be_started_by_hand(start: Start, tmp_path: Path) -> None:
     """One from the file, one with its configuration on standard input."""
     hosts = write_hosts(tmp_path, "print", "same_clock = true")

@@ -81,6 +81,7 @@ def test_late_ticks_are_counted_and_held_and_the_arm_goes_on(start: Start) -> No
     assert cli.gone() == {}
 
 
+@pytest.mark.every
 def test_too_many_late_ticks_in_a_row_make_the_arm_safe(start: Start) -> None:
     hold = 5
     cli = start.run(
@@ -129,6 +130,7 @@ def test_real_time_scheduling_is_used_where_it_is_permitted_and_said_where_not(
         assert urgent == {"octarm-node0", "octarm-node1", "octarm-node2", "octarm-plant"}
 
 
+@pytest.mark.variants("3")
 @pytest.mark.parametrize("per_process", [2, 3, 5])
 def test_segments_that_share_a_process_do_the_same(start: Start, per_process: int) -> None:
     nodes, ticks = 6, 40

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from conftest import Start
 
 
+@pytest.mark.variants("2-40", "20-15")
 @pytest.mark.parametrize(("nodes", "ticks"), [(2, 40), (3, 40), (10, 30), (20, 15)])
 def test_exactly_two_messages_per_cut_and_tick(start: Start, nodes: int, ticks: int) -> None:
     cli = start.run("--nodes", str(nodes), "--ticks", str(ticks), "--json", "--no-plot")
