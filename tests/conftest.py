@@ -25,6 +25,7 @@ from analysis.recording import Recording, read_recording
 from chaos.aftermath import Expected, Remains, violations
 from chaos.processes import end_all, living, marked
 from chaos.trial import BEGUN
+from wire.errors import OctarmError
 
 ROOT = Path(__file__).resolve().parents[1]
 PATIENCE_S = 120.0
@@ -100,12 +101,22 @@ class Cli:
         self._wait_for_writes(2)
 
     def wait_for_ticks(self) -> None:
-        """The same of a run that prints nothing."""
+        """The same of a run that prints nothing: what is written first is not a tick, so the file is read."""
         limit = time.monotonic() + PATIENCE_S
-        while not list(self.work.glob("**/recording.mcap")):
-            assert time.monotonic() < limit, "no recording"
-            time.sleep(0.02)
-        self._wait_for_writes(2)
+        while self._recorded_ticks() == 0:
+            assert time.monotonic() < limit, "no tick in the recording"
+            time.sleep(0.05)
+        self._wait_for_writes(1)
+
+    def _recorded_ticks(self) -> int:
+        if self.popen.poll() is not None:
+            self.finish()
+            pytest.fail(f"ended before its first tick was recorded:\n{self.err}")
+        found = list(self.work.glob("**/recording.mcap"))
+        try:
+            return read_recording(found[0]).ticks if found else 0
+        except OctarmError:
+            return 0
 
     def wait_for_more(self) -> None:
         """Wait until the recorder has written twice more."""

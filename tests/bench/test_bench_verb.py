@@ -115,6 +115,7 @@ def test_an_interruption_keeps_what_is_finished_and_leaves_nothing(
     assert "Traceback" not in cli.err
 
 
+@pytest.mark.every
 def test_a_killed_benchmark_leaves_no_process_and_no_socket(start: Start) -> None:
     cli = interrupt_during(start, signal.SIGKILL)
     assert cli.finish() == -signal.SIGKILL

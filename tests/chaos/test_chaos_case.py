@@ -39,6 +39,7 @@ def _sabotage(
     return result.wrong
 
 
+@pytest.mark.every
 def test_a_left_over_socket_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def spoil(scene: Scene, _: Fault) -> str:
         with socket.socket(socket.AF_UNIX) as bound:
@@ -49,6 +50,7 @@ def test_a_left_over_socket_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert wrong == "left in the run's TMPDIR: socket stray"
 
 
+@pytest.mark.every
 def test_an_orphan_is_found_and_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     marks: list[str] = []
 

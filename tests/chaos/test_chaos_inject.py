@@ -166,6 +166,7 @@ def test_garbage_is_sent_and_refused(start: Start, variant: str) -> None:
     assert (cli.recorded().counter("rejected_messages") or 0) > 20
 
 
+@pytest.mark.every
 def test_a_stranger_that_asks_for_everything_and_reads_nothing_holds_nobody_up(
     start: Start,
 ) -> None:
@@ -202,6 +203,7 @@ def test_directories_vanish(running: tuple[Cli, Scene, Later]) -> None:
     assert inject(scene, _fault("directory gone"), begun=True) is None
 
 
+@pytest.mark.variants("kill")
 @pytest.mark.parametrize("kind", ["kill", "interrupt", "terminate"])
 def test_signals_reach_the_launcher(running: tuple[Cli, Scene, Later], kind: str) -> None:
     cli, scene, _ = running

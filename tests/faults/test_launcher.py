@@ -155,6 +155,7 @@ def test_node_killed_during_start_up_is_named(start: Start, node: int) -> None:
     cli.ends(Expected((5,), said=said, recording=False))
 
 
+@pytest.mark.every
 @pytest.mark.parametrize(
     ("name", "says"),
     [
@@ -175,6 +176,7 @@ def test_process_that_is_stopped_before_it_reads_its_configuration_is_named(
     cli.ends(Expected((5,), said=said, recording=False))
 
 
+@pytest.mark.every
 def test_interrupt_while_a_configuration_waits_to_be_read(start: Start) -> None:
     cli = start.run("--nodes", "40", "--ticks", "10", "--no-plot")
     limit = time.monotonic() + 20.0

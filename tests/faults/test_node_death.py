@@ -217,6 +217,7 @@ def test_several_at_once_are_replaced(
     assert np.nanmax(estimates_apart(found, alone)[-5:]) < APART
 
 
+@pytest.mark.every
 def test_two_at_once_in_real_time(start: Start) -> None:
     replaced(start, 2, 3, arguments=REALTIME, ticks=120)
 

@@ -148,6 +148,7 @@ def test_two_stopped_at_once(start: Start) -> None:
     passive_from(cli.recorded())
 
 
+@pytest.mark.every
 def test_two_stuck_at_once_are_replaced(start: Start) -> None:
     cli = start.run(*REALTIME, "--ticks", "150", "--restart")
     cli.wait_for_records()

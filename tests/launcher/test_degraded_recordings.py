@@ -127,6 +127,7 @@ def test_a_node_that_was_killed_and_replaced(
     assert published["rows_published"] == told + TICKS
 
 
+@pytest.mark.every
 def test_sweeps_that_are_given_up_are_replayed(start: Start) -> None:
     """A node that is frozen for longer than a sweep is waited for: late ticks, then every tick has a sweep
     again that the others close."""

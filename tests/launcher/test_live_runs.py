@@ -126,6 +126,7 @@ def started_by_hand(start: Start, cli: Cli) -> Cli:
     return start.node(str(found[0]))
 
 
+@pytest.mark.every
 def test_a_run_that_is_watched_has_the_numbers_of_one_that_is_not(start: Start) -> None:
     same = ("--nodes", "4", "--ticks", "400", "--no-plot")
     plain = start.run(*same, "--quiet")

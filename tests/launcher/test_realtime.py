@@ -47,6 +47,7 @@ def test_a_run_in_real_time_that_misses_nothing_has_the_numbers_of_lock_step(sta
     np.testing.assert_allclose(np.diff(due), float(period) * 1e9, atol=0.5)
 
 
+@pytest.mark.every
 def test_late_ticks_are_counted_and_held_and_the_arm_goes_on(start: Start) -> None:
     nodes, ticks = 4, 120
     cli = start.run(

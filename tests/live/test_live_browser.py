@@ -141,6 +141,7 @@ def test_the_page_shows_the_running_arm_and_how_it_ends(
     page.close()
 
 
+@pytest.mark.every
 def test_a_recording_goes_round_on_the_page(start: Start, browser: Any) -> None:
     run = start.run("--nodes", str(NODES), "--ticks", "100", "--no-plot", "--quiet")
     assert run.finish() == 0, run.err
@@ -162,6 +163,7 @@ def test_a_recording_goes_round_on_the_page(start: Start, browser: Any) -> None:
     visit.page.close()
 
 
+@pytest.mark.every
 def test_a_lost_connection_is_said_and_greys_the_page(start: Start, browser: Any) -> None:
     cli = start.run(*RUN, "1000000")
     visit = Visit(browser, url_of(cli))
@@ -211,6 +213,7 @@ def test_a_narrow_window_has_everything_below_each_other(
     assert cli.finish() == 130
 
 
+@pytest.mark.every
 def test_a_finished_run_stays_on_the_page(start: Start, browser: Any) -> None:
     cli = start.run(*RUN, "60", "--by-hand", "1")
     visit = Visit(browser, url_of(cli))
