@@ -11,12 +11,13 @@ run: $(STAMP)
 
 # Hundreds of processes are started: were their modules compiled anew each time, a fifth of it would be that.
 TEST_ENV := OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=
+# Three workers on two cores: part of the time is waiting for real time to pass.
 test: $(TEST_STAMP)
-	$(TEST_ENV) $(BIN)/python -m pytest -n 2
+	$(TEST_ENV) $(BIN)/python -m pytest -n 3
 
 # With every variant of the tests that inject faults into real processes, and what others show as well: twice as long.
 test-all: $(TEST_STAMP)
-	$(TEST_ENV) $(BIN)/python -m pytest -n 2 --every
+	$(TEST_ENV) $(BIN)/python -m pytest -n 3 --every
 
 lint: $(TEST_STAMP)
 	$(BIN)/ruff check .

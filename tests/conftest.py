@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 from closed_form import write_gains
 from hypothesis import settings
+from turns import turn
 
 from analysis.recording import Recording, read_recording
 from chaos.aftermath import Expected, Remains, violations
@@ -216,6 +217,8 @@ def one_run(work: Path, gains: Path, *arguments: str) -> Iterator[Path]:
         cli.close()
 
 
+PROCESSES = ("bench", "chaos", "faults", "fuzz", "launcher", "live", "recorder", "security")
+"""Folders of tests of real processes, many of them in real time."""
 FAULTS = ("faults", "security")
 """Folders whose tests take seconds of real time each, many of them for every node, flow and way."""
 
@@ -232,6 +235,7 @@ def pytest_configure(config: pytest.Config) -> None:
     for line in (
         "every: what others show as well, and slow: left out unless --every is given",
         "variants(*ids): without --every these parameters only",
+        "alone: takes all cores; no test of real processes runs meanwhile (tests/turns.py)",
     ):
         config.addinivalue_line("markers", line)
 
@@ -260,6 +264,20 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left_out:
         config.hook.pytest_deselected(items=[item for item in items if id(item) in left_out])
         items[:] = [item for item in items if id(item) not in left_out]
+
+
+@pytest.fixture(autouse=True)
+def _turn(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[None]:
+    """Tests of real processes give way to one that takes all cores."""
+    alone = request.node.get_closest_marker("alone") is not None
+    if not alone and request.path.parent.name not in PROCESSES:
+        yield
+        return
+    base = tmp_path_factory.getbasetemp()
+    with turn(base.parent if "PYTEST_XDIST_WORKER" in os.environ else base, alone=alone):
+        yield
 
 
 @pytest.fixture(scope="session")

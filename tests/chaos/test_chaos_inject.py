@@ -108,6 +108,7 @@ def test_processes_are_stopped_woken_and_slowed(running: tuple[Cli, Scene, Later
     assert _state(zygote) == psutil.STATUS_STOPPED
 
 
+@pytest.mark.alone
 def test_limits_loads_and_strangers_come(running: tuple[Cli, Scene, Later]) -> None:
     cli, scene, later = running
     before = cli.processes()

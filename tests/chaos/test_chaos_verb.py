@@ -39,6 +39,7 @@ def _family(cli: Cli) -> list[psutil.Process]:
         time.sleep(0.02)
 
 
+@pytest.mark.alone
 def test_a_short_campaign_survives_and_reports(start: Start) -> None:
     cli = start("chaos", "--seed", "20", "--minutes", "4", "--faults", "15", "--json")
     assert cli.finish(patience_s=280.0) == 0, cli.out + cli.err

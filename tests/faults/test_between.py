@@ -43,7 +43,7 @@ NODE = 2
 FOUR = ("--nodes", "4", "--seed", "5")
 SHORT = (*FOUR, "--no-plot")
 HOLD = 10
-PERIOD_S = 0.03
+PERIOD_S = 0.04
 REALTIME = (*SHORT, "--realtime", "--period", str(PERIOD_S), "--hold-ticks", str(HOLD))
 GIVEN_UP = HOLD / 2 + 4.0
 """Periods after which the tick of a message has been given up: with the late tick H / 2 + 1, and whoever waits

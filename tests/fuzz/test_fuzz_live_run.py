@@ -27,6 +27,7 @@ def refused(recording: Recording) -> Counter[str]:
     return Counter({n: recording.process_counters(n).get("rejected_messages", 0) for n in names})
 
 
+@pytest.mark.alone
 @pytest.mark.variants("unix")
 @pytest.mark.parametrize("transport", ["unix", "tcp"])
 def test_a_run_in_real_time_refuses_every_mutant_by_name_and_keeps_its_rate(

@@ -117,6 +117,7 @@ def test_a_flood_changes_no_number(
     named(recording, kind)
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("kind", ["handshakes", "puts"])
 def test_real_time_keeps_its_rate_in_a_flood(
     start: Start, keys: Path, undisturbed: Recording, kind: str
