@@ -180,6 +180,12 @@ def table(found: dict[str, dict[str, list[Figures]]]) -> str:
     return "\n".join(lines)
 
 
+def as_json(found: dict[str, dict[str, list[Figures]]]) -> str:
+    """The figures of every run by case and way, and the machine."""
+    plain = {c: {w: [vars(r) for r in runs] for w, runs in f.items()} for c, f in found.items()}
+    return json.dumps({"machine": platform.platform(), "runs": plain})
+
+
 def main() -> None:
     """Measure and print, or be a watcher of the measurement."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -200,11 +206,7 @@ def main() -> None:
     if given.browser:
         ways["Chromium"] = (True, [["--browse"]])
     found = measure(given.case or list(CASES), ways, given.rounds)
-    if given.json:
-        plain = {c: {w: [vars(r) for r in runs] for w, runs in f.items()} for c, f in found.items()}
-        print(json.dumps({"machine": platform.platform(), "runs": plain}))
-    else:
-        print(table(found))
+    print(as_json(found) if given.json else table(found))
 
 
 if __name__ == "__main__":

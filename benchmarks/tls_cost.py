@@ -10,8 +10,6 @@ n + 1 messages of the longest way of a tick: measurement, n - 1 sums, command.
 from __future__ import annotations
 
 import argparse
-import json
-import platform
 import statistics
 import subprocess
 import sys
@@ -19,7 +17,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from live_overhead import CASES, ROOT, Figures, in_turn, medians, run_once
+from live_overhead import CASES, ROOT, Figures, as_json, in_turn, medians, run_once
 
 HOPS = {"lockstep-10": 11, "lockstep-50": 51, "fifo-250Hz-10": 11}
 
@@ -70,11 +68,7 @@ def main() -> None:
         subprocess.run([*make, "--out", str(keys)], check=True, stdout=subprocess.DEVNULL)
         ways = {"unix": [], "tcp": ["--transport", "tcp"], "keys": ["--keys", str(keys)]}
         found = measure(given.case or list(CASES), ways, given.rounds)
-    if given.json:
-        plain = {c: {w: [vars(r) for r in runs] for w, runs in f.items()} for c, f in found.items()}
-        print(json.dumps({"machine": platform.platform(), "runs": plain}))
-    else:
-        print(table(found))
+    print(as_json(found) if given.json else table(found))
 
 
 if __name__ == "__main__":
