@@ -21,6 +21,7 @@ import pytest
 from closed_form import write_gains
 from hypothesis import settings
 from turns import turn
+from waiting import until
 
 from analysis.recording import Recording, read_recording
 from chaos.aftermath import Expected, Remains, violations
@@ -103,10 +104,9 @@ class Cli:
 
     def wait_for_ticks(self) -> None:
         """The same of a run that prints nothing: what is written first is not a tick, so the file is read."""
-        limit = time.monotonic() + PATIENCE_S
-        while self._recorded_ticks() == 0:
-            assert time.monotonic() < limit, "no tick in the recording"
-            time.sleep(0.05)
+        until(
+            lambda: self._recorded_ticks() > 0, PATIENCE_S, "no tick in the recording", every_s=0.05
+        )
         self._wait_for_writes(1)
 
     def _recorded_ticks(self) -> int:
@@ -123,13 +123,21 @@ class Cli:
         """Wait until the recorder has written twice more."""
         self._wait_for_writes(2)
 
+    def _recorded_bytes(self) -> int:
+        return self.recording().stat().st_size
+
     def _wait_for_writes(self, times: int) -> None:
-        limit = time.monotonic() + PATIENCE_S
         for _ in range(times):
-            size = self.recording().stat().st_size
-            while self.recording().stat().st_size == size:
-                assert time.monotonic() < limit, "the recorder writes nothing"
-                time.sleep(0.02)
+            self._wait_for_a_write(PATIENCE_S / times)
+
+    def _wait_for_a_write(self, seconds: float) -> None:
+        before = self._recorded_bytes()
+        until(
+            lambda: self._recorded_bytes() != before,
+            seconds,
+            "the recorder writes nothing",
+            every_s=0.02,
+        )
 
     def finish(self, patience_s: float = PATIENCE_S) -> int:
         """Wait for the end; returns the exit code."""

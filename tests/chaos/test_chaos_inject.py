@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import resource
 import signal
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import psutil
 import pytest
+from waiting import until
 
 from chaos.draw import LAUNCHER, RUN, Fault, RunDraw
 from chaos.inject import CYCLE_S, INJECTORS, inject
@@ -67,11 +69,7 @@ def _state(pid: int) -> str:
     return psutil.Process(pid).status()
 
 
-def _until(true: Callable[[], bool]) -> None:
-    limit = time.monotonic() + 60.0
-    while not true():
-        assert time.monotonic() < limit
-        time.sleep(0.01)
+_until = functools.partial(until, seconds=60.0)
 
 
 def test_processes_are_stopped_woken_and_slowed(running: tuple[Cli, Scene, Later]) -> None:

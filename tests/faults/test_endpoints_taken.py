@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from ports import free_ports
+from waiting import until
 
 from chaos.aftermath import Expected
-from supervise.endpoints import STALE_AFTER_S, choose, port_taken
+from supervise.endpoints import STALE_AFTER_S, port_taken
 
 if TYPE_CHECKING:
     from conftest import Start
@@ -21,14 +23,9 @@ if TYPE_CHECKING:
 FOUR = ("--nodes", "4", "--no-plot")
 
 
-def _base_port(count: int) -> int:
-    """The first of so many free ports in a row."""
-    return int(choose(count, "tcp", None, None).plant.rpartition(":")[2])
-
-
 @pytest.mark.parametrize("offset", [0, 2])
 def test_taken_port_is_refused_before_the_start(start: Start, offset: int) -> None:
-    base = _base_port(4)
+    base = free_ports(4)
     with socket.create_server(("127.0.0.1", base + offset)):
         cli = start.run(*FOUR, "--ticks", "20", "--transport", "tcp", "--base-port", str(base))
         said = (
@@ -41,14 +38,11 @@ def test_taken_port_is_refused_before_the_start(start: Start, offset: int) -> No
 @pytest.mark.parametrize(("offset", "who"), [(0, "plant"), (2, "node 1")])
 def test_port_taken_between_the_check_and_the_use(start: Start, offset: int, who: str) -> None:
     """The launcher is stopped when it has checked (its log is there) and before its processes listen."""
-    base = _base_port(4)
+    base = free_ports(4)
     cli = start.run(
         *(*FOUR, "--ticks", "20", "--transport", "tcp", "--base-port", str(base), "--out", "out")
     )
-    limit = time.monotonic() + 30
-    while not (cli.work / "out" / "processes.log").exists():
-        assert time.monotonic() < limit
-        time.sleep(0.0005)
+    until((cli.work / "out" / "processes.log").exists, 30.0, every_s=0.0005)
     os.kill(cli.popen.pid, signal.SIGSTOP)  # it cannot have started who must load modules first
     port = base + offset
     with contextlib.ExitStack() as stack:

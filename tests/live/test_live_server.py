@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 import socket
@@ -14,6 +15,7 @@ from contextlib import ExitStack
 from html.parser import HTMLParser
 
 import pytest
+import waiting
 
 from live.server import HEADERS, MOST_CONNECTIONS, PAGE, LiveServer
 from live.server import PATIENCE_S as SILENCE_S
@@ -82,12 +84,7 @@ def read_until(client: socket.socket, text: bytes) -> bytes:
     return got
 
 
-def until(condition: object, seconds: float = WAIT_S) -> None:
-    assert callable(condition)
-    limit = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < limit
-        time.sleep(0.01)
+until = functools.partial(waiting.until, seconds=WAIT_S)
 
 
 # -- files ------------------------------------------------------------------------------------------

@@ -6,15 +6,16 @@ Sessions of one chain in this process, over real unix sockets, with the settings
 
 from __future__ import annotations
 
+import functools
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Lock
-from time import monotonic, sleep
 from typing import Any
 
 import pytest
+from waiting import until
 
 from wire.keys import Keys
 from wire.session import (
@@ -70,11 +71,7 @@ class Chain:
             session.close()
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
-    limit = monotonic() + LIMIT_S
-    while not condition():
-        assert monotonic() < limit, "did not happen in time"
-        sleep(0.002)
+wait_until = functools.partial(until, seconds=LIMIT_S, every_s=0.002)
 
 
 @pytest.fixture
